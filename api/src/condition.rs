@@ -1,0 +1,91 @@
+//! Conditions of an object, as Kubernetes writes them.
+
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+/// Whether a condition holds.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, JsonSchema)]
+pub enum ConditionStatus {
+    /// It holds.
+    True,
+    /// It does not hold.
+    False,
+    /// Not known now.
+    Unknown,
+}
+
+impl From<bool> for ConditionStatus {
+    fn from(holds: bool) -> Self {
+        if holds { ConditionStatus::True } else { ConditionStatus::False }
+    }
+}
+
+/// One named fact about an object, with the reason it is so.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "camelCase")]
+pub struct Condition {
+    /// Which fact, `Ready`.
+    pub r#type: String,
+    /// Whether it holds.
+    pub status: ConditionStatus,
+    /// Why, in one CamelCase word.
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    pub reason: String,
+    /// Why, in a sentence.
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    pub message: String,
+    /// When `status` last changed.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub last_transition_time: Option<Time>,
+}
+
+/// The node takes part: its agent has been heard within the detection time.
+pub const READY: &str = "Ready";
+/// Quotas of tasks are enforced by the kernel on this node (invariant 7).
+pub const QUOTAS_ENFORCED: &str = "QuotasEnforced";
+
+/// Sets the condition of the same type, or adds it; the transition time moves only when the status
+/// changes. Says whether anything changed.
+pub fn set_condition(conditions: &mut Vec<Condition>, mut new: Condition, now: &Time) -> bool {
+    let Some(old) = conditions.iter_mut().find(|c| c.r#type == new.r#type) else {
+        new.last_transition_time = Some(now.clone());
+        conditions.push(new);
+        return true;
+    };
+    new.last_transition_time =
+        if old.status == new.status { old.last_transition_time.clone() } else { Some(now.clone()) };
+    let changed = *old != new;
+    *old = new;
+    changed
+}
+
+#[cfg(test)]
+mod tests {
+    use k8s_openapi::jiff::Timestamp;
+
+    use super::*;
+
+    fn ready(status: ConditionStatus, message: &str) -> Condition {
+        Condition {
+            r#type: READY.to_owned(),
+            status,
+            reason: String::new(),
+            message: message.to_owned(),
+            last_transition_time: None,
+        }
+    }
+
+    #[test]
+    fn the_transition_time_moves_only_with_the_status() {
+        let at = |s| Time(Timestamp::from_second(s).expect("in range"));
+        let mut all = Vec::new();
+        assert!(set_condition(&mut all, ready(ConditionStatus::True, ""), &at(1)));
+        assert!(set_condition(&mut all, ready(ConditionStatus::True, "still"), &at(2)));
+        assert_eq!(all[0].last_transition_time, Some(at(1)));
+        assert!(!set_condition(&mut all, ready(ConditionStatus::True, "still"), &at(3)));
+        assert!(set_condition(&mut all, ready(ConditionStatus::Unknown, "still"), &at(4)));
+        assert_eq!(all[0].last_transition_time, Some(at(4)));
+        assert_eq!(all.len(), 1);
+    }
+}

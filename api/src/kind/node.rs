@@ -1,0 +1,224 @@
+//! Node: a robot or a cloud server that runs an agent.
+
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::MicroTime;
+use kube::CustomResource;
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+use super::{KindInfo, admit_spec};
+use crate::condition::{self, Condition, ConditionStatus};
+use crate::id::{Epoch, Incarnation};
+use crate::kind::lease::LeaseHolder;
+use crate::name::FunctionName;
+use crate::pose::Pose;
+use crate::resource::Compute;
+use crate::validate::{Violations, element_path};
+
+/// What a node is.
+#[derive(
+    Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize, JsonSchema,
+)]
+pub enum NodeKind {
+    /// Has a pose, and may have sensors and actuators.
+    Robot,
+    /// Computation only; has no pose, and no range filter drops it.
+    Cloud,
+}
+
+/// What an operator decides about a node.
+#[derive(CustomResource, Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[kube(
+    group = "muster.dev",
+    version = "v1alpha1",
+    kind = "Node",
+    plural = "nodes",
+    status = "NodeStatus",
+    derive = "PartialEq",
+    shortname = "no"
+)]
+#[serde(rename_all = "camelCase", deny_unknown_fields)]
+pub struct NodeSpec {
+    /// What the node is.
+    pub kind: NodeKind,
+    /// True: nothing new is placed here (`muster cordon`); what runs goes on.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub unschedulable: bool,
+    /// Marks that keep tasks away which do not tolerate them.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub taints: Vec<Taint>,
+    /// Usual speed of a robot, metres per second; the cost `TravelTime` needs it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub speed: Option<f64>,
+}
+
+/// A mark on a node.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "camelCase", deny_unknown_fields)]
+pub struct Taint {
+    /// The mark.
+    pub key: String,
+    /// Its value.
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    pub value: String,
+    /// What it does.
+    pub effect: TaintEffect,
+}
+
+/// What a taint does to tasks that do not tolerate it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+pub enum TaintEffect {
+    /// They are not placed here.
+    NoSchedule,
+    /// They are placed here only when there is no better node.
+    PreferNoSchedule,
+}
+
+/// What a node has and does, as its agent reports it and the controller accounts it.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "camelCase", default)]
+pub struct NodeStatus {
+    /// CR of the machine.
+    pub capacity: Compute,
+    /// CR that tasks may reserve: capacity less what the system needs.
+    pub allocatable: Compute,
+    /// CR that tasks have reserved (the paper's *used*).
+    pub used: Compute,
+    /// CR that is left (the paper's *allocatable*).
+    pub free: Compute,
+    /// SR: always allocatable, any number of tasks share them.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub sensors: Vec<FunctionName>,
+    /// AR: one task at a time.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub actuators: Vec<FunctionName>,
+    /// The leases of the node's actuators.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub leases: Vec<NodeLease>,
+    /// A coarse checkpoint of where the robot is.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub pose: Option<Pose>,
+    /// Facts about the node; `Ready` is the controller's, the others are the agent's.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub conditions: Vec<Condition>,
+    /// How tasks can be run there.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub runtimes: Vec<RuntimeStatus>,
+    /// When the agent was last heard, as far as it is written down.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub last_seen: Option<MicroTime>,
+    /// The life of the agent that reported all this.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub incarnation: Option<Incarnation>,
+    /// The agent's version.
+    #[serde(skip_serializing_if = "String::is_empty")]
+    pub agent_version: String,
+    /// The machine's address as the controller sees it.
+    #[serde(skip_serializing_if = "String::is_empty")]
+    pub address: String,
+}
+
+/// The state of one conflict group of a robot's actuators.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "camelCase")]
+pub struct NodeLease {
+    /// The conflict group.
+    pub group: String,
+    /// The number of the newest grant.
+    pub epoch: Epoch,
+    /// The holder; none: free.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub holder: Option<LeaseHolder>,
+}
+
+/// A way to run tasks on a node.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "camelCase")]
+pub struct RuntimeStatus {
+    /// `process` or `docker`.
+    pub name: String,
+    /// Whether it can be used now.
+    pub available: bool,
+    /// Its version.
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    pub version: String,
+    /// Why it cannot be used.
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    pub message: String,
+}
+
+impl NodeStatus {
+    /// The condition of this type.
+    #[must_use]
+    pub fn condition(&self, r#type: &str) -> Option<&Condition> {
+        self.conditions.iter().find(|c| c.r#type == r#type)
+    }
+
+    /// The agent has been heard within the detection time.
+    #[must_use]
+    pub fn is_ready(&self) -> bool {
+        self.condition(condition::READY).is_some_and(|c| c.status == ConditionStatus::True)
+    }
+}
+
+fn rules(spec: &NodeSpec, violations: &mut Violations) {
+    if let Some(speed) = spec.speed.filter(|s| !(*s > 0.0 && s.is_finite())) {
+        violations
+            .invalid("spec.speed", format!("{speed} is not a speed in m/s"))
+            .suggest("try 0.5");
+    }
+    for (i, taint) in spec.taints.iter().enumerate() {
+        let path = element_path("spec.taints", i);
+        if taint.key.is_empty() {
+            violations.required(format!("{path}.key"));
+        }
+        if spec.taints[..i].iter().any(|t| t.key == taint.key && t.effect == taint.effect) {
+            violations
+                .duplicate(path, format!("{:?} is there twice with the same effect", taint.key));
+        }
+    }
+    if spec.kind == NodeKind::Cloud && spec.speed.is_some() {
+        violations.forbidden("spec.speed", "a Cloud node does not move").suggest("leave it out");
+    }
+}
+
+fn kind_stays(old: &serde_json::Value, new: &serde_json::Value, violations: &mut Violations) {
+    let kind = |object: &serde_json::Value| object.pointer("/spec/kind").cloned();
+    if kind(old) != kind(new) {
+        violations
+            .forbidden("spec.kind", "a node stays what it joined as")
+            .suggest("delete the node and let its agent join again");
+    }
+}
+
+pub(super) const INFO: KindInfo = KindInfo {
+    group: crate::GROUP,
+    version: crate::VERSION,
+    kind: "Node",
+    plural: "nodes",
+    singular: "node",
+    short_names: &["no"],
+    namespaced: false,
+    has_status: true,
+    selectable: &["spec.kind", "spec.unschedulable"],
+    admit_body: |object, violations| admit_spec::<NodeSpec>(object, violations, rules),
+    admit_change: kind_stays,
+};
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use crate::kind::{admit, admit_change, find};
+
+    #[test]
+    fn a_node_keeps_its_kind() {
+        let node = |kind: &str| {
+            admit(&json!({"apiVersion": crate::API_VERSION, "kind": "Node", "metadata": {"name": "n"}, "spec": {"kind": kind}}))
+                .expect("a node")
+        };
+        let info = find(crate::API_VERSION, "Node").expect("served");
+        admit_change(info, &node("Robot"), &node("Robot")).expect("the same");
+        let error = admit_change(info, &node("Robot"), &node("Cloud")).expect_err("another kind");
+        assert!(error.to_string().starts_with("spec.kind: "), "{error}");
+    }
+}

@@ -1,0 +1,38 @@
+//! What every part of muster speaks: resource kinds, the types they are made of, manifests and
+//! wire messages. No runtime and no I/O: a function of this crate is given text or bytes and gives
+//! back values or reasons.
+//!
+//! | module | holds |
+//! |---|---|
+//! | [`kind`] | the resources (Node, Task, Lease, Namespace, Event): spec, status, admission |
+//! | [`manifest`] | YAML or JSON text → objects whose every field knows its file, line and column |
+//! | [`validate`] | violations (path, reason, suggestion) and the walk over a kind's schema |
+//! | [`selector`] | label and field selectors, both forms and their string grammar |
+//! | [`name`], [`id`] | names and identities as types |
+//! | [`quantity`], [`duration`] | cpu, bytes, time spans with their units |
+//! | [`resource`] | CR, SR and AR: what nodes have and tasks ask for |
+//! | [`pose`] | where a robot is, in which map |
+//! | [`phase`], [`condition`] | states as enums |
+//! | [`wire`] | generated protobuf messages and their conversions; wire types stop there |
+#![deny(missing_docs)]
+
+pub mod condition;
+pub mod duration;
+pub mod id;
+pub mod kind;
+pub mod manifest;
+pub mod name;
+pub mod phase;
+pub mod pose;
+pub mod quantity;
+pub mod resource;
+pub mod selector;
+pub mod validate;
+pub mod wire;
+
+/// The API group of muster's own kinds.
+pub const GROUP: &str = "muster.dev";
+/// The version of muster's own kinds.
+pub const VERSION: &str = "v1alpha1";
+/// `apiVersion` of muster's own kinds.
+pub const API_VERSION: &str = "muster.dev/v1alpha1";
