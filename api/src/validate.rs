@@ -460,6 +460,7 @@ mod tests {
 
     #[derive(Deserialize, JsonSchema)]
     #[serde(rename_all = "camelCase", deny_unknown_fields)]
+    #[expect(dead_code, reason = "only its schema is used")]
     struct Sample {
         cpu: Option<MilliCpu>,
         how: Option<How>,
@@ -469,7 +470,6 @@ mod tests {
     }
 
     #[derive(Deserialize, JsonSchema)]
-    #[expect(dead_code, reason = "only its schema is used")]
     enum How {
         /// One way.
         Never,

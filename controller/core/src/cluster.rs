@@ -1,0 +1,264 @@
+//! The cluster as the scheduler knows it: every node with its facts and its ledger, and the orders
+//! in which nodes are tried.
+//!
+//! It is rebuilt from the store at start and fed with every change afterwards. Feeding the same
+//! state twice changes nothing, so the scheduler's own writes may come back through the store.
+
+use std::cmp::Reverse;
+use std::collections::{BTreeSet, HashMap};
+
+use muster_api::id::{Epoch, TaskUid};
+use muster_api::kind::lease::DEFAULT_GROUP;
+use muster_api::kind::node::{Node, NodeKind, RuntimeStatus, Taint};
+use muster_api::name::{FunctionName, NodeName};
+use muster_api::pose::Pose;
+use muster_api::quantity::{Bytes, MilliCpu};
+use muster_api::selector::Labels;
+
+use crate::ledger::{Denied, NodeLedger, Reservation};
+use crate::space::{Slot, Space};
+
+/// What filters need to know of a node.
+#[derive(Debug, Clone, PartialEq)]
+pub struct NodeFacts {
+    /// Robot or cloud.
+    pub kind: NodeKind,
+    /// Its labels.
+    pub labels: Labels,
+    /// Cordoned.
+    pub unschedulable: bool,
+    /// Its taints.
+    pub taints: Vec<Taint>,
+    /// Metres per second.
+    pub speed: Option<f64>,
+    /// `None`: ready; otherwise what the Ready condition says.
+    pub not_ready: Option<String>,
+    /// SR.
+    pub sensors: BTreeSet<FunctionName>,
+    /// AR.
+    pub actuators: BTreeSet<FunctionName>,
+    /// Where it is.
+    pub pose: Option<Pose>,
+    /// How tasks can be run.
+    pub runtimes: Vec<RuntimeStatus>,
+}
+
+impl NodeFacts {
+    /// The conflict groups that a task with these actuators takes: all of the robot's when it takes
+    /// any (Avalon, III-B), none when it takes none.
+    #[must_use]
+    pub fn groups_for(&self, actuators: &[FunctionName]) -> Vec<String> {
+        if actuators.is_empty() { Vec::new() } else { vec![DEFAULT_GROUP.to_owned()] }
+    }
+}
+
+impl From<&Node> for NodeFacts {
+    fn from(node: &Node) -> Self {
+        let status = node.status.clone().unwrap_or_default();
+        let not_ready = (!status.is_ready()).then(|| {
+            let said = status.condition(muster_api::condition::READY);
+            said.map_or_else(|| "its agent has not joined".to_owned(), |c| c.message.clone())
+        });
+        NodeFacts {
+            kind: node.spec.kind,
+            labels: node.metadata.labels.clone().unwrap_or_default(),
+            unschedulable: node.spec.unschedulable,
+            taints: node.spec.taints.clone(),
+            speed: node.spec.speed,
+            not_ready,
+            sensors: status.sensors.into_iter().collect(),
+            actuators: status.actuators.into_iter().collect(),
+            pose: status.pose,
+            runtimes: status.runtimes,
+        }
+    }
+}
+
+/// One node: what it is, and what of it is taken.
+#[derive(Debug, Clone)]
+pub struct Member {
+    /// The node's name.
+    pub name: NodeName,
+    /// `None`: no Node object, but a task says that it is placed there.
+    pub facts: Option<NodeFacts>,
+    /// Its books.
+    pub ledger: NodeLedger,
+    in_order: Option<FreeKey>,
+}
+
+/// Kind, then most free cpu, then most free memory, then the order of joining.
+type FreeKey = (NodeKind, Reverse<MilliCpu>, Reverse<Bytes>, Slot);
+
+/// Every node, found by name, by place and by what is free.
+#[derive(Debug, Clone, Default)]
+pub struct Cluster {
+    members: Vec<Member>,
+    slots: HashMap<NodeName, Slot>,
+    placed: HashMap<TaskUid, Slot>,
+    space: Space,
+    by_free: BTreeSet<FreeKey>,
+}
+
+impl Cluster {
+    /// No nodes yet.
+    #[must_use]
+    pub fn new() -> Self {
+        Cluster::default()
+    }
+
+    fn slot(&mut self, name: &NodeName) -> Slot {
+        if let Some(slot) = self.slots.get(name) {
+            return *slot;
+        }
+        let slot = Slot::try_from(self.members.len()).expect("fewer than 2^32 nodes");
+        self.members.push(Member {
+            name: name.clone(),
+            facts: None,
+            ledger: NodeLedger::default(),
+            in_order: None,
+        });
+        self.slots.insert(name.clone(), slot);
+        slot
+    }
+
+    /// Takes in the present state of a Node object.
+    pub fn upsert_node(&mut self, name: &NodeName, node: &Node) {
+        let slot = self.slot(name);
+        let facts = NodeFacts::from(node);
+        let allocatable = node.status.as_ref().map(|s| s.allocatable.clone()).unwrap_or_default();
+        self.index_pose(slot, facts.kind, facts.pose.as_ref());
+        let member = &mut self.members[slot as usize];
+        member.ledger.set_allocatable(allocatable);
+        member.facts = Some(facts);
+        self.reorder(slot);
+    }
+
+    /// A robot moved; poses come more often than Node objects change.
+    pub fn set_pose(&mut self, name: &NodeName, pose: &Pose) {
+        let Some(&slot) = self.slots.get(name) else { return };
+        let Some(facts) = self.members[slot as usize].facts.as_mut() else { return };
+        facts.pose = Some(pose.clone());
+        let kind = facts.kind;
+        self.index_pose(slot, kind, Some(pose));
+    }
+
+    fn index_pose(&mut self, slot: Slot, kind: NodeKind, pose: Option<&Pose>) {
+        match pose.filter(|p| kind == NodeKind::Robot && p.localized) {
+            Some(pose) => self.space.insert(slot, &pose.map, pose.position()),
+            None => self.space.remove(slot),
+        }
+    }
+
+    /// The Node object is gone. What tasks hold there stays booked until they end.
+    pub fn remove_node(&mut self, name: &NodeName) {
+        let Some(&slot) = self.slots.get(name) else { return };
+        self.space.remove(slot);
+        self.members[slot as usize].facts = None;
+        self.reorder(slot);
+    }
+
+    /// Books a task that the store says is placed.
+    pub fn book(&mut self, uid: &TaskUid, node: &NodeName, reservation: Reservation) {
+        let slot = self.slot(node);
+        self.placed.insert(uid.clone(), slot);
+        self.members[slot as usize].ledger.book(uid, reservation);
+        self.reorder(slot);
+    }
+
+    /// Reserves for a task by a decision of ours.
+    ///
+    /// # Errors
+    ///
+    /// What stands against it.
+    pub fn reserve(
+        &mut self,
+        uid: &TaskUid,
+        slot: Slot,
+        reservation: Reservation,
+    ) -> Result<(), Denied> {
+        self.members[slot as usize].ledger.reserve(uid, reservation)?;
+        self.placed.insert(uid.clone(), slot);
+        self.reorder(slot);
+        Ok(())
+    }
+
+    /// Takes in the present state of a Lease object.
+    pub fn set_lease(
+        &mut self,
+        node: &NodeName,
+        group: &str,
+        epoch: Epoch,
+        holder: Option<TaskUid>,
+    ) {
+        let slot = self.slot(node);
+        self.members[slot as usize].ledger.set_group(group, epoch, holder);
+    }
+
+    /// Frees what a task holds; gives the node it was on, if it held anything.
+    pub fn release(&mut self, uid: &TaskUid) -> Option<NodeName> {
+        let slot = self.placed.remove(uid)?;
+        let member = &mut self.members[slot as usize];
+        member.ledger.release(uid);
+        let name = member.name.clone();
+        self.reorder(slot);
+        Some(name)
+    }
+
+    fn reorder(&mut self, slot: Slot) {
+        let member = &mut self.members[slot as usize];
+        let free = member.ledger.free();
+        let key =
+            member.facts.as_ref().map(|f| (f.kind, Reverse(free.cpu), Reverse(free.memory), slot));
+        if key == member.in_order {
+            return;
+        }
+        if let Some(old) = member.in_order.take() {
+            self.by_free.remove(&old);
+        }
+        if let Some(key) = key {
+            member.in_order = Some(key);
+            self.by_free.insert(key);
+        }
+    }
+
+    /// A node by name.
+    #[must_use]
+    pub fn member(&self, name: &NodeName) -> Option<&Member> {
+        self.slots.get(name).map(|slot| &self.members[*slot as usize])
+    }
+
+    /// A node by its number.
+    #[must_use]
+    pub fn at(&self, slot: Slot) -> &Member {
+        &self.members[slot as usize]
+    }
+
+    /// The number of a node.
+    #[must_use]
+    pub fn slot_of(&self, name: &str) -> Option<Slot> {
+        self.slots.get(name).copied()
+    }
+
+    /// The node a task is placed on.
+    #[must_use]
+    pub fn node_of(&self, uid: &TaskUid) -> Option<&Member> {
+        self.placed.get(uid).map(|slot| &self.members[*slot as usize])
+    }
+
+    /// Every node that has a Node object.
+    pub fn members(&self) -> impl Iterator<Item = (Slot, &Member)> {
+        (0_u32..).zip(&self.members).filter(|(_, m)| m.facts.is_some())
+    }
+
+    /// Nodes of one kind, most free CR first.
+    pub fn by_free(&self, kind: NodeKind) -> impl Iterator<Item = Slot> {
+        let first = (kind, Reverse(MilliCpu(u64::MAX)), Reverse(Bytes(u64::MAX)), 0);
+        self.by_free.range(first..).take_while(move |key| key.0 == kind).map(|key| key.3)
+    }
+
+    /// Where the robots are.
+    #[must_use]
+    pub fn space(&self) -> &Space {
+        &self.space
+    }
+}

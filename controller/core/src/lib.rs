@@ -1,0 +1,26 @@
+//! The pure core of the controller: it decides, and does nothing else.
+//!
+//! No clock, no I/O, no randomness: time comes in as an argument, and what comes out is data. The
+//! same code runs in production, in `muster plan`, in `muster why` and in simulation.
+//!
+//! ```text
+//!   store events ──▶ Cluster (nodes, ledger, space) ──schedule()──▶ Plan { binds, waits }
+//!   heartbeats  ──▶ NodeHealth ──tick()──▶ who was lost, who is back
+//! ```
+//!
+//! | module | decides |
+//! |---|---|
+//! | [`ledger`] | what each node has left, and who holds its actuators (invariants 1 and 2) |
+//! | [`space`] | which robots are nearest, without a scan |
+//! | [`cluster`] | the nodes with their ledgers, and the orders in which they are tried |
+//! | [`schedule`] | where a task goes, or why it goes nowhere (invariant 6) |
+//! | [`node_health`] | when a node counts as lost |
+//! | [`report`] | typed reasons, with the words people read |
+#![deny(missing_docs)]
+
+pub mod cluster;
+pub mod ledger;
+pub mod node_health;
+pub mod report;
+pub mod schedule;
+pub mod space;

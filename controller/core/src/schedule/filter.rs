@@ -1,0 +1,115 @@
+//! Which nodes can take a task at all. The filters stand in the order of how hard their reasons are
+//! to change, so that the first refusal is the one worth reading.
+
+use muster_api::kind::node::{NodeKind, TaintEffect};
+use muster_api::kind::task::{Cost, NodeChoice, TaskSpec};
+use muster_api::name::FunctionName;
+
+use super::Demand;
+use crate::cluster::{Member, NodeFacts};
+use crate::ledger::Denied;
+use crate::report::Refusal;
+
+/// The first reason for which `member` does not take the task; none: it does.
+#[must_use]
+pub fn refusal(member: &Member, demand: &Demand) -> Option<Refusal> {
+    let Some(facts) = &member.facts else {
+        return Some(Refusal::NotReady { message: "its Node object is gone".to_owned() });
+    };
+    let spec = &*demand.spec;
+    identity(member.name.as_str(), facts, spec)
+        .or_else(|| abilities(facts, spec))
+        .or_else(|| too_small(member, spec))
+        .or_else(|| admission(facts, spec))
+        .or_else(|| reach(facts, spec))
+        .or_else(|| what_is_left(member, facts, demand))
+}
+
+fn identity(name: &str, facts: &NodeFacts, spec: &TaskSpec) -> Option<Refusal> {
+    let placement = &spec.placement;
+    if let Some(node) = placement.node.as_ref().filter(|n| *n != name) {
+        return Some(Refusal::PinnedElsewhere { node: node.clone() });
+    }
+    if !spec.allows_kind(facts.kind) {
+        return Some(Refusal::WrongKind {
+            kind: facts.kind,
+            by_choice: placement.on != NodeChoice::Any,
+        });
+    }
+    (!placement.selector.matches(&facts.labels))
+        .then(|| Refusal::SelectorMismatch { selector: placement.selector.to_string() })
+}
+
+fn abilities(facts: &NodeFacts, spec: &TaskSpec) -> Option<Refusal> {
+    let runtime = if spec.run.container.is_some() { "docker" } else { "process" };
+    let offered = facts.runtimes.iter().find(|r| r.name == runtime);
+    if !offered.is_some_and(|r| r.available) {
+        let message = offered.map(|r| r.message.clone()).unwrap_or_default();
+        return Some(Refusal::NoRuntime { runtime, message });
+    }
+    let lacking = |asked: &[FunctionName],
+                   has: &std::collections::BTreeSet<FunctionName>|
+     -> Vec<FunctionName> {
+        asked.iter().filter(|f| !has.contains(*f)).cloned().collect()
+    };
+    let missing = lacking(&spec.resources.sensors, &facts.sensors);
+    if !missing.is_empty() {
+        return Some(Refusal::NoSensor { missing });
+    }
+    let missing = lacking(&spec.resources.actuators, &facts.actuators);
+    (!missing.is_empty()).then_some(Refusal::NoActuator { missing })
+}
+
+fn too_small(member: &Member, spec: &TaskSpec) -> Option<Refusal> {
+    // A node that never reported has nothing; "not ready" says more about it.
+    let ready = member.facts.as_ref().is_some_and(|f| f.not_ready.is_none());
+    let shortage = member.ledger.allocatable().shortage_for(&spec.resources.reserved())?;
+    ready.then_some(Refusal::TooSmall { shortage })
+}
+
+fn admission(facts: &NodeFacts, spec: &TaskSpec) -> Option<Refusal> {
+    let keeps_away = |t: &&muster_api::kind::node::Taint| {
+        t.effect == TaintEffect::NoSchedule
+            && !spec.placement.tolerations.iter().any(|o| o.tolerates(t))
+    };
+    if let Some(taint) = facts.taints.iter().find(keeps_away) {
+        return Some(Refusal::Tainted { taint: taint.clone() });
+    }
+    if facts.unschedulable {
+        return Some(Refusal::Cordoned);
+    }
+    facts.not_ready.as_ref().map(|message| Refusal::NotReady { message: message.clone() })
+}
+
+/// The range filter (Avalon, Alg. 1). Cloud nodes have no pose; it does not apply to them.
+fn reach(facts: &NodeFacts, spec: &TaskSpec) -> Option<Refusal> {
+    let at = spec.placement.at.as_ref().filter(|_| facts.kind == NodeKind::Robot)?;
+    let Some(pose) = &facts.pose else {
+        return Some(Refusal::NoPose);
+    };
+    if !pose.localized {
+        return Some(Refusal::NotLocalized);
+    }
+    let Some(distance) = at.distance_to(pose) else {
+        return Some(Refusal::OtherMap { robot: pose.map.clone(), wanted: at.map.clone() });
+    };
+    if let Some(within) = spec.placement.within.filter(|w| distance > *w) {
+        return Some(Refusal::OutOfRange { distance, within });
+    }
+    (spec.placement.cost == Cost::TravelTime && facts.speed.is_none()).then_some(Refusal::NoSpeed)
+}
+
+fn what_is_left(member: &Member, facts: &NodeFacts, demand: &Demand) -> Option<Refusal> {
+    let resources = &demand.spec.resources;
+    let groups = facts.groups_for(&resources.actuators);
+    match member.ledger.check(&resources.reserved(), &groups).err()? {
+        Denied::Short(shortage) => Some(Refusal::Exhausted { shortage }),
+        Denied::Held { group, holder } => {
+            let title = member
+                .ledger
+                .reservation(&holder)
+                .map_or_else(|| holder.to_string(), |r| r.title.to_string());
+            Some(Refusal::LeaseHeld { group, holder: title })
+        }
+    }
+}

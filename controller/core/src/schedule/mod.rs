@@ -1,0 +1,292 @@
+//! Where tasks go: filter → score → bind (DESIGN §5; Avalon, III-C).
+//!
+//! [`schedule`] takes the waiting tasks and the cluster, and gives a [`Plan`]: which task is bound
+//! where, and for every other one why no node takes it. The plan's reservations are made in the
+//! cluster as it goes; whoever cannot carry a bind out releases it again.
+//!
+//! Order of tasks: priority, then who waited longest. Order of nodes: a task that needs computation
+//! only tries the cloud first; robots by score where there is an operation position; else by most
+//! free CR. Nodes with a taint of effect PreferNoSchedule come last.
+
+pub mod filter;
+pub mod score;
+
+use std::sync::Arc;
+
+use muster_api::id::{Epoch, TaskUid};
+use muster_api::kind::node::{NodeKind, TaintEffect};
+use muster_api::kind::task::{Cost, NodeRefusal, TaskSpec};
+use muster_api::name::NodeName;
+
+use crate::cluster::{Cluster, NodeFacts};
+use crate::ledger::Reservation;
+use crate::report::Refusal;
+use crate::space::Slot;
+
+/// A task that waits for a place.
+#[derive(Debug, Clone)]
+pub struct Demand {
+    /// Its uid.
+    pub uid: TaskUid,
+    /// `namespace/name`.
+    pub title: Arc<str>,
+    /// What it is and needs.
+    pub spec: Arc<TaskSpec>,
+    /// When it was created, as the store's revision: who waits longest comes first.
+    pub since: u64,
+}
+
+impl Demand {
+    fn reservation(&self, facts: &NodeFacts) -> Reservation {
+        Reservation {
+            title: Arc::clone(&self.title),
+            compute: self.spec.resources.reserved(),
+            groups: facts.groups_for(&self.spec.resources.actuators),
+        }
+    }
+}
+
+/// A task gets a place.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Bind {
+    /// The task.
+    pub uid: TaskUid,
+    /// The node.
+    pub node: NodeName,
+    /// The node's score, metres or seconds.
+    pub score: Option<f64>,
+    /// Granted conflict groups with the numbers of the grants.
+    pub leases: Vec<(String, Epoch)>,
+}
+
+/// A task gets none.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Wait {
+    /// The task.
+    pub uid: TaskUid,
+    /// Why, per node.
+    pub why: Vec<NodeRefusal>,
+}
+
+/// What is to be done.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Plan {
+    /// Tasks that get a place, in the order of decision.
+    pub binds: Vec<Bind>,
+    /// Tasks that wait, each with its reasons.
+    pub waits: Vec<Wait>,
+}
+
+/// Most nodes that are named in a task's reasons; the others are counted. A status must not grow
+/// with the fleet: 10 000 waiting tasks on 5 000 nodes would be gigabytes.
+pub const WHY_LIMIT: usize = 16;
+
+/// Decides for all waiting tasks at once.
+pub fn schedule(cluster: &mut Cluster, demands: &mut [Demand]) -> Plan {
+    demands.sort_by_key(|d| (std::cmp::Reverse(d.spec.priority), d.since));
+    let mut plan = Plan::default();
+    // A pass only takes, so what had no place for a task has none for one that asks the same.
+    let mut hopeless: Vec<(Arc<TaskSpec>, Vec<NodeRefusal>)> = Vec::new();
+    for demand in demands.iter() {
+        let known = hopeless.iter().find(|(spec, _)| asks_the_same(spec, &demand.spec));
+        if let Some((_, why)) = known {
+            plan.waits.push(Wait { uid: demand.uid.clone(), why: why.clone() });
+            continue;
+        }
+        match choose(cluster, demand) {
+            Some(slot) => plan.binds.push(take(cluster, demand, slot)),
+            None => {
+                let why = summarise(explain(cluster, demand));
+                if hopeless.len() == HOPELESS_KEPT {
+                    hopeless.remove(0);
+                }
+                hopeless.push((Arc::clone(&demand.spec), why.clone()));
+                plan.waits.push(Wait { uid: demand.uid.clone(), why });
+            }
+        }
+    }
+    plan
+}
+
+/// How many refused demands a pass remembers. Queues are mostly copies of a few templates; a longer
+/// memory would cost more in comparing than it saves in scanning.
+const HOPELESS_KEPT: usize = 8;
+
+fn asks_the_same(a: &TaskSpec, b: &TaskSpec) -> bool {
+    a.resources == b.resources
+        && a.placement == b.placement
+        && a.run.container.is_some() == b.run.container.is_some()
+}
+
+fn take(cluster: &mut Cluster, demand: &Demand, slot: Slot) -> Bind {
+    let member = cluster.at(slot);
+    let facts = member.facts.as_ref().expect("a chosen node passed the filters, so it has facts");
+    let (node, score) = (member.name.clone(), score::score(facts, &demand.spec));
+    let reservation = demand.reservation(facts);
+    let groups = reservation.groups.clone();
+    cluster
+        .reserve(&demand.uid, slot, reservation)
+        .expect("the last filter asked the same ledger, and nothing came in between");
+    let ledger = &cluster.at(slot).ledger;
+    let leases = groups
+        .into_iter()
+        .map(|g| (ledger.group(&g).epoch, g))
+        .map(|(epoch, g)| (g, epoch))
+        .collect();
+    Bind { uid: demand.uid.clone(), node, score, leases }
+}
+
+/// The best node that takes the task.
+fn choose(cluster: &Cluster, demand: &Demand) -> Option<Slot> {
+    let spec = &*demand.spec;
+    if let Some(node) = &spec.placement.node {
+        let slot = cluster.slot_of(node)?;
+        return filter::refusal(cluster.at(slot), demand).is_none().then_some(slot);
+    }
+    let mut second_best = None;
+    if spec.resources.is_compute_only() {
+        // A CR-only task prefers the cloud: robots' CR is scarce, and it gains nothing there.
+        let cloud = first_fit(cluster, demand, cluster.by_free(NodeKind::Cloud), &mut second_best);
+        if cloud.is_some() {
+            return cloud;
+        }
+    }
+    let robot = match (&spec.placement.at, spec.placement.cost) {
+        (None, _) => first_fit(cluster, demand, cluster.by_free(NodeKind::Robot), &mut second_best),
+        (Some(_), Cost::Distance) => nearest_fit(cluster, demand, &mut second_best),
+        (Some(_), Cost::TravelTime) => best_scored(cluster, demand, &mut second_best),
+    };
+    robot.or(second_best)
+}
+
+/// Whether a taint asks to leave the node for last.
+fn is_last_resort(cluster: &Cluster, demand: &Demand, slot: Slot) -> bool {
+    let Some(facts) = &cluster.at(slot).facts else { return false };
+    let tolerations = &demand.spec.placement.tolerations;
+    facts.taints.iter().any(|t| {
+        t.effect == TaintEffect::PreferNoSchedule && !tolerations.iter().any(|o| o.tolerates(t))
+    })
+}
+
+/// The first of `slots` that takes the task; one that should be left for last goes to `second_best`.
+fn first_fit(
+    cluster: &Cluster,
+    demand: &Demand,
+    slots: impl Iterator<Item = Slot>,
+    second_best: &mut Option<Slot>,
+) -> Option<Slot> {
+    for slot in slots {
+        if filter::refusal(cluster.at(slot), demand).is_some() {
+            continue;
+        }
+        if !is_last_resort(cluster, demand, slot) {
+            return Some(slot);
+        }
+        second_best.get_or_insert(slot);
+    }
+    None
+}
+
+/// The nearest robot that takes the task; of equally near ones that with the most free cpu.
+fn nearest_fit(cluster: &Cluster, demand: &Demand, second_best: &mut Option<Slot>) -> Option<Slot> {
+    let at = demand.spec.placement.at.as_ref()?;
+    let radius = demand.spec.placement.within.unwrap_or(f64::INFINITY);
+    let mut best: Option<(f64, Slot)> = None;
+    for found in cluster.space().nearest(&at.map, at.position(), radius) {
+        if best.is_some_and(|(distance, _)| found.distance > distance) {
+            break;
+        }
+        if filter::refusal(cluster.at(found.slot), demand).is_some() {
+            continue;
+        }
+        if is_last_resort(cluster, demand, found.slot) {
+            second_best.get_or_insert(found.slot);
+            continue;
+        }
+        let free = |slot: Slot| cluster.at(slot).ledger.free().cpu;
+        if best.is_none_or(|(_, slot)| free(found.slot) > free(slot)) {
+            best = Some((found.distance, found.slot));
+        }
+    }
+    best.map(|(_, slot)| slot)
+}
+
+/// The robot with the lowest score, where the order of scores is not that of distances.
+fn best_scored(cluster: &Cluster, demand: &Demand, second_best: &mut Option<Slot>) -> Option<Slot> {
+    let at = demand.spec.placement.at.as_ref()?;
+    let radius = demand.spec.placement.within.unwrap_or(f64::INFINITY);
+    let mut scored: Vec<(f64, std::cmp::Reverse<u64>, Slot)> = cluster
+        .space()
+        .nearest(&at.map, at.position(), radius)
+        .filter(|found| filter::refusal(cluster.at(found.slot), demand).is_none())
+        .filter_map(|found| {
+            let member = cluster.at(found.slot);
+            let score = score::score(member.facts.as_ref()?, &demand.spec)?;
+            Some((score, std::cmp::Reverse(member.ledger.free().cpu.0), found.slot))
+        })
+        .collect();
+    scored.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
+    first_fit(cluster, demand, scored.into_iter().map(|(_, _, slot)| slot), second_best)
+}
+
+/// Why each node does not take the task, those that only have to be waited for first.
+#[must_use]
+pub fn explain(cluster: &Cluster, demand: &Demand) -> Vec<(NodeName, Refusal)> {
+    let mut refusals: Vec<(NodeName, Refusal)> = cluster
+        .members()
+        .filter_map(|(_, member)| Some((member.name.clone(), filter::refusal(member, demand)?)))
+        .collect();
+    refusals
+        .sort_by(|(a_name, a), (b_name, b)| hardness(a).cmp(&hardness(b)).then(a_name.cmp(b_name)));
+    refusals
+}
+
+/// What ends by itself comes first, what the task's owner must change last.
+fn hardness(refusal: &Refusal) -> u8 {
+    match refusal {
+        Refusal::LeaseHeld { .. } | Refusal::Exhausted { .. } => 0,
+        Refusal::OutOfRange { .. } | Refusal::NoPose | Refusal::NotLocalized => 1,
+        Refusal::NotReady { .. } | Refusal::Cordoned | Refusal::Tainted { .. } => 2,
+        Refusal::TooSmall { .. } | Refusal::NoRuntime { .. } | Refusal::NoSpeed => 3,
+        Refusal::NoSensor { .. } | Refusal::NoActuator { .. } | Refusal::OtherMap { .. } => 4,
+        Refusal::SelectorMismatch { .. }
+        | Refusal::WrongKind { .. }
+        | Refusal::PinnedElsewhere { .. } => 5,
+    }
+}
+
+/// The reasons as a status carries them: at most [`WHY_LIMIT`] nodes, the others counted by reason.
+#[must_use]
+pub fn summarise(refusals: Vec<(NodeName, Refusal)>) -> Vec<NodeRefusal> {
+    if refusals.is_empty() {
+        return vec![NodeRefusal {
+            node: String::new(),
+            reason: "NoNodes".to_owned(),
+            message: "no node has joined; `muster token create` prints how one does".to_owned(),
+        }];
+    }
+    let rest = refusals.split_at(WHY_LIMIT.min(refusals.len())).1;
+    let mut counts: std::collections::BTreeMap<&'static str, usize> =
+        std::collections::BTreeMap::new();
+    for (_, refusal) in rest {
+        *counts.entry(refusal.reason()).or_default() += 1;
+    }
+    let more = (!rest.is_empty()).then(|| NodeRefusal {
+        node: String::new(),
+        reason: "More".to_owned(),
+        message: format!(
+            "{} more nodes: {}",
+            rest.len(),
+            counts.iter().map(|(reason, n)| format!("{n} {reason}")).collect::<Vec<_>>().join(", ")
+        ),
+    });
+    refusals
+        .iter()
+        .take(WHY_LIMIT)
+        .map(|(node, refusal)| refusal.of_node(node.as_str()))
+        .chain(more)
+        .collect()
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,290 @@
+//! Placement rules one by one, and that fast choice agrees with a scan over every node.
+
+use muster_api::condition::{self, Condition, ConditionStatus};
+use muster_api::kind::node::{Node, NodeSpec, NodeStatus, RuntimeStatus};
+use muster_api::pose::Pose;
+use muster_api::quantity::{Bytes, MilliCpu};
+use muster_api::resource::{Compute, parse_function_list};
+use proptest::prelude::*;
+use serde_json::json;
+
+use super::*;
+
+fn name(text: &str) -> NodeName {
+    NodeName::new(text).expect("a name")
+}
+
+fn node(kind: NodeKind, cpu: u64, at: Option<(f64, f64)>) -> Node {
+    let mut node =
+        Node::new("n", NodeSpec { kind, unschedulable: false, taints: Vec::new(), speed: None });
+    let robot = kind == NodeKind::Robot;
+    let functions = |text| parse_function_list(text).expect("functions").into_iter().collect();
+    node.status = Some(NodeStatus {
+        allocatable: Compute::new(MilliCpu(cpu), Bytes(1 << 30)),
+        sensors: if robot { functions("kinect:ImageGen,LaserGen") } else { Vec::new() },
+        actuators: if robot { functions("base:Drive;arm:Grasp") } else { Vec::new() },
+        pose: at.map(|(x, y)| Pose {
+            map: "map".to_owned(),
+            x,
+            y,
+            z: 0.0,
+            yaw: 0.0,
+            stamp: None,
+            source: String::new(),
+            localized: true,
+        }),
+        conditions: vec![Condition {
+            r#type: condition::READY.to_owned(),
+            status: ConditionStatus::True,
+            reason: String::new(),
+            message: String::new(),
+            last_transition_time: None,
+        }],
+        runtimes: vec![RuntimeStatus {
+            name: "process".to_owned(),
+            available: true,
+            version: String::new(),
+            message: String::new(),
+        }],
+        ..NodeStatus::default()
+    });
+    node
+}
+
+fn cluster(nodes: &[(&str, Node)]) -> Cluster {
+    let mut cluster = Cluster::new();
+    for (node_name, node) in nodes {
+        cluster.upsert_node(&name(node_name), node);
+    }
+    cluster
+}
+
+fn demand(uid: &str, mut spec: serde_json::Value) -> Demand {
+    spec["run"] = json!({"process": {"command": ["true"]}});
+    Demand {
+        uid: TaskUid::new(uid),
+        title: format!("default/{uid}").into(),
+        spec: Arc::new(serde_json::from_value(spec).expect("a spec")),
+        since: 0,
+    }
+}
+
+fn bound(plan: &Plan) -> Vec<(&str, &str)> {
+    plan.binds.iter().map(|b| (b.uid.as_str(), b.node.as_str())).collect()
+}
+
+fn reasons(plan: &Plan) -> Vec<(&str, &str)> {
+    plan.waits.iter().flat_map(|w| &w.why).map(|w| (w.node.as_str(), w.reason.as_str())).collect()
+}
+
+use NodeKind::{Cloud, Robot};
+
+#[test]
+fn the_nearest_robot_inside_the_radius_is_taken_and_its_score_is_the_distance() {
+    let mut cluster = cluster(&[
+        ("far", node(Robot, 1000, Some((10.0, 0.0)))),
+        ("near", node(Robot, 1000, Some((3.0, 4.0)))),
+        ("cloud", node(Cloud, 9000, None)),
+    ]);
+    let spec = json!({"placement": {"at": {"x": 0.0, "y": 0.0}, "within": 5.0}, "resources": {"sensors": ["kinect:ImageGen"]}});
+    let plan = schedule(&mut cluster, &mut [demand("t", spec)]);
+    assert_eq!(bound(&plan), [("t", "near")]);
+    assert_eq!(plan.binds[0].score, Some(5.0), "the rim is inside");
+}
+
+#[test]
+fn a_compute_only_task_prefers_the_cloud_and_on_robot_keeps_it_away() {
+    let nodes =
+        [("robot", node(Robot, 1000, Some((0.0, 0.0)))), ("cloud", node(Cloud, 1000, None))];
+    let at = json!({"at": {"x": 0.0, "y": 0.0}, "within": 1.0});
+    let plan = schedule(
+        &mut cluster(&nodes),
+        &mut [demand("t", json!({"placement": at, "resources": {"cpu": 1}}))],
+    );
+    assert_eq!(bound(&plan), [("t", "cloud")]);
+    assert_eq!(plan.binds[0].score, None);
+    let plan = schedule(
+        &mut cluster(&nodes),
+        &mut [demand("t", json!({"placement": {"on": "Robot"}, "resources": {"cpu": 1}}))],
+    );
+    assert_eq!(bound(&plan), [("t", "robot")]);
+    let mut big = [
+        demand("a", json!({"resources": {"cpu": 1}})),
+        demand("b", json!({"resources": {"cpu": 1}})),
+    ];
+    let plan = schedule(&mut cluster(&nodes), &mut big);
+    assert_eq!(
+        bound(&plan),
+        [("a", "cloud"), ("b", "robot")],
+        "the robot serves when the cloud is full"
+    );
+}
+
+#[test]
+fn a_robot_is_shared_by_ar_sr_and_cr_tasks_but_driven_by_one() {
+    let mut cluster = cluster(&[("r", node(Robot, 1000, Some((0.0, 0.0))))]);
+    let drive = json!({"resources": {"cpu": "300m", "actuators": ["base:Drive"], "sensors": ["kinect:LaserGen"]}});
+    let grasp = json!({"resources": {"actuators": ["arm:Grasp"]}});
+    let look = json!({"resources": {"sensors": ["kinect:ImageGen"]}});
+    let mut all =
+        [demand("a", drive), demand("b", look.clone()), demand("c", look), demand("d", grasp)];
+    let plan = schedule(&mut cluster, &mut all);
+    assert_eq!(bound(&plan), [("a", "r"), ("b", "r"), ("c", "r")]);
+    assert_eq!(plan.binds[0].leases, [("body".to_owned(), Epoch(1))]);
+    assert_eq!(reasons(&plan), [("r", "LeaseHeld")], "any AR takes all AR of the robot");
+    assert!(plan.waits[0].why[0].message.contains("held by default/a"), "{:?}", plan.waits);
+
+    cluster.release(&TaskUid::new("a"));
+    let plan = schedule(&mut cluster, &mut all[3..]);
+    assert_eq!(bound(&plan), [("d", "r")]);
+    assert_eq!(plan.binds[0].leases, [("body".to_owned(), Epoch(2))]);
+}
+
+#[test]
+fn priority_goes_first_then_who_waits_longest() {
+    let mut cluster = cluster(&[("c", node(Cloud, 1000, None))]);
+    let one = |uid: &str, priority: i32, since| Demand {
+        since,
+        ..demand(uid, json!({"priority": priority, "resources": {"cpu": "400m"}}))
+    };
+    let plan =
+        schedule(&mut cluster, &mut [one("young", 0, 9), one("old", 0, 1), one("urgent", 5, 20)]);
+    assert_eq!(bound(&plan), [("urgent", "c"), ("old", "c")]);
+    assert_eq!(reasons(&plan), [("c", "Exhausted")]);
+}
+
+#[test]
+fn each_node_says_why_not() {
+    let mut nodes: Vec<(&str, Node)> =
+        ["cordoned", "tainted", "silent", "lost", "far", "other-map", "small", "blind"]
+            .into_iter()
+            .map(|n| (n, node(Robot, 1000, Some((0.0, 0.0)))))
+            .collect();
+    let status = |n: &mut Node, f: fn(&mut NodeStatus)| f(n.status.as_mut().expect("set"));
+    nodes[0].1.spec.unschedulable = true;
+    nodes[1].1.spec.taints =
+        serde_json::from_value(json!([{"key": "battery", "value": "low", "effect": "NoSchedule"}]))
+            .expect("taints");
+    status(&mut nodes[2].1, |s| s.pose = None);
+    status(&mut nodes[3].1, |s| s.conditions[0].status = ConditionStatus::Unknown);
+    status(&mut nodes[4].1, |s| s.pose.as_mut().expect("set").x = 50.0);
+    status(&mut nodes[5].1, |s| s.pose.as_mut().expect("set").map = "hall".to_owned());
+    status(&mut nodes[6].1, |s| s.allocatable.cpu = MilliCpu(100));
+    status(&mut nodes[7].1, |s| s.sensors.clear());
+    nodes.push(("cloud", node(Cloud, 1000, None)));
+    let spec = json!({
+        "placement": {"at": {"x": 0.0, "y": 0.0}, "within": 20.0},
+        "resources": {"cpu": "500m", "sensors": ["kinect:ImageGen"]},
+    });
+    let plan = schedule(&mut cluster(&nodes), &mut [demand("t", spec)]);
+    assert_eq!(plan.binds, []);
+    let mut all = reasons(&plan);
+    all.sort_unstable();
+    assert_eq!(
+        all,
+        [
+            ("blind", "NoSensor"),
+            ("cloud", "WrongKind"),
+            ("cordoned", "Cordoned"),
+            ("far", "OutOfRange"),
+            ("lost", "NotReady"),
+            ("other-map", "OtherMap"),
+            ("silent", "NoPose"),
+            ("small", "TooSmall"),
+            ("tainted", "Tainted"),
+        ]
+    );
+}
+
+#[test]
+fn a_cluster_without_nodes_says_so_and_a_large_one_counts() {
+    let plan = schedule(&mut Cluster::new(), &mut [demand("t", json!({}))]);
+    assert_eq!(reasons(&plan), [("", "NoNodes")]);
+    let nodes: Vec<(String, Node)> =
+        (0..40).map(|i| (format!("c{i:02}"), node(Cloud, 100, None))).collect();
+    let nodes: Vec<(&str, Node)> =
+        nodes.iter().map(|(n, node)| (n.as_str(), node.clone())).collect();
+    let plan = schedule(&mut cluster(&nodes), &mut [demand("t", json!({"resources": {"cpu": 1}}))]);
+    let why = &plan.waits[0].why;
+    assert_eq!(why.len(), WHY_LIMIT + 1);
+    assert_eq!(why[WHY_LIMIT].message, "24 more nodes: 24 TooSmall");
+}
+
+#[test]
+fn a_node_marked_prefer_no_schedule_is_the_last_resort() {
+    let mut reluctant = node(Robot, 9000, Some((0.0, 0.0)));
+    reluctant.spec.taints =
+        serde_json::from_value(json!([{"key": "charging", "effect": "PreferNoSchedule"}]))
+            .expect("taints");
+    let mut cluster = cluster(&[("a", reluctant), ("b", node(Robot, 500, Some((9.0, 0.0))))]);
+    let spec = json!({"placement": {"at": {"x": 0.0, "y": 0.0}, "on": "Robot"}, "resources": {"cpu": "400m"}});
+    let plan = schedule(&mut cluster, &mut [demand("t", spec.clone()), demand("u", spec)]);
+    assert_eq!(bound(&plan), [("t", "b"), ("u", "a")]);
+}
+
+#[test]
+fn travel_time_divides_by_speed() {
+    let mut slow = node(Robot, 1000, Some((2.0, 0.0)));
+    slow.spec.speed = Some(0.1);
+    let mut fast = node(Robot, 1000, Some((10.0, 0.0)));
+    fast.spec.speed = Some(2.0);
+    let nodes = [("slow", slow), ("fast", fast), ("unknown", node(Robot, 1000, Some((0.0, 0.0))))];
+    let spec =
+        json!({"placement": {"at": {"x": 0.0, "y": 0.0}, "cost": "TravelTime", "on": "Robot"}});
+    let plan = schedule(&mut cluster(&nodes), &mut [demand("t", spec)]);
+    assert_eq!(bound(&plan), [("t", "fast")]);
+    assert_eq!(plan.binds[0].score, Some(5.0));
+}
+
+/// What `choose` must agree with: the best of all nodes that pass, by the written order.
+fn by_scan(cluster: &Cluster, demand: &Demand) -> Option<(bool, u64)> {
+    cluster
+        .members()
+        .filter(|(_, m)| filter::refusal(m, demand).is_none())
+        .map(|(_, m)| {
+            let facts = m.facts.as_ref().expect("it passed");
+            let on_robot = facts.kind == Robot;
+            let score = score::score(facts, &demand.spec).unwrap_or(0.0);
+            (on_robot, (score * 1e6) as u64)
+        })
+        .min()
+}
+
+proptest! {
+    #[test]
+    fn the_fast_choice_is_the_best_of_all_nodes(
+        nodes in proptest::collection::vec((any::<bool>(), 1..10_u64, -20..20_i32, -20..20_i32, any::<bool>()), 1..40),
+        tasks in proptest::collection::vec((0..6_u64, -20..20_i32, proptest::option::of(0..30_u32), 0..4_u8), 1..20),
+    ) {
+        let mut cluster = Cluster::new();
+        for (i, (robot, cpu, x, y, cordoned)) in nodes.into_iter().enumerate() {
+            let kind = if robot { Robot } else { Cloud };
+            let mut node = node(kind, cpu * 100, robot.then_some((f64::from(x), f64::from(y))));
+            node.spec.unschedulable = cordoned;
+            cluster.upsert_node(&name(&format!("n{i}")), &node);
+        }
+        for (i, (cpu, x, within, class)) in tasks.into_iter().enumerate() {
+            let mut spec = json!({"placement": {"at": {"x": x, "y": 0}}, "resources": {"cpu": format!("{}m", cpu * 100)}});
+            if let Some(within) = within {
+                spec["placement"]["within"] = json!(within);
+            }
+            match class {
+                0 => spec["resources"]["actuators"] = json!(["base:Drive"]),
+                1 => spec["resources"]["sensors"] = json!(["kinect:ImageGen"]),
+                _ => {}
+            }
+            let demand = demand(&format!("t{i}"), spec);
+            let expected = by_scan(&cluster, &demand);
+            let plan = schedule(&mut cluster, &mut [demand]);
+            let got = plan.binds.first().map(|b| {
+                let on_robot = cluster.member(&b.node).and_then(|m| m.facts.as_ref()).is_some_and(|f| f.kind == Robot);
+                (on_robot, (b.score.unwrap_or(0.0) * 1e6) as u64)
+            });
+            prop_assert_eq!(got, expected);
+            prop_assert_eq!(plan.binds.len() + plan.waits.len(), 1);
+            for (_, member) in cluster.members() {
+                prop_assert!(member.ledger.used().cpu <= member.ledger.allocatable().cpu);
+            }
+        }
+    }
+}
