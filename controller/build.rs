@@ -1,0 +1,19 @@
+//! Compiles the server side of the gRPC services, without a `protoc` on the machine. The messages are
+//! `muster_api`'s.
+
+use std::path::Path;
+
+fn main() -> Result<(), Box<dyn std::error::Error>> {
+    let root = Path::new("../api/proto");
+    println!("cargo:rerun-if-changed=../api/proto");
+    let files = protox::compile([root.join("muster/agent/v1/agent.proto")], [root])?;
+    tonic_prost_build::configure()
+        .build_client(false)
+        .server_mod_attribute(
+            ".",
+            "#[allow(clippy::allow_attributes_without_reason, reason = \"generated\")]",
+        )
+        .extern_path(".muster.agent.v1", "::muster_api::wire::agent::v1")
+        .compile_fds(files)?;
+    Ok(())
+}

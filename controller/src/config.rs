@@ -1,0 +1,62 @@
+//! What the controller is told at start.
+
+use std::net::SocketAddr;
+use std::path::PathBuf;
+
+/// The flags of `muster-controller` and of `muster controller`.
+#[derive(Debug, Clone, clap::Args)]
+pub struct Args {
+    /// Where the store and the certificates are kept [default: ~/.muster/controller]
+    #[arg(long, value_name = "DIR", env = "MUSTER_DATA_DIR")]
+    pub data_dir: Option<PathBuf>,
+    /// The address of the one port for REST and agents
+    #[arg(long, value_name = "ADDR", default_value = "127.0.0.1:7443")]
+    pub listen: SocketAddr,
+    /// Where the admin's kubeconfig is written [default: ~/.muster/config]
+    #[arg(long, value_name = "FILE")]
+    pub kubeconfig: Option<PathBuf>,
+    /// A name or address under which agents reach this controller; may be given several times
+    #[arg(long, value_name = "HOST")]
+    pub advertise: Vec<String>,
+}
+
+/// What the controller needs to know to run.
+#[derive(Debug, Clone)]
+pub struct Config {
+    /// Holds the store, the certificates and the lock. Created when it is missing.
+    pub data_dir: PathBuf,
+    /// Port 0 takes a free one.
+    pub listen: SocketAddr,
+    /// Where the admin's kubeconfig is written.
+    pub kubeconfig: PathBuf,
+    /// Names and addresses for the certificate and for join commands, best first.
+    pub advertise: Vec<String>,
+}
+
+impl From<Args> for Config {
+    fn from(args: Args) -> Self {
+        let home = std::env::home_dir().unwrap_or_else(|| PathBuf::from("."));
+        let own = home.join(".muster");
+        Self {
+            data_dir: args.data_dir.unwrap_or_else(|| own.join("controller")),
+            listen: args.listen,
+            kubeconfig: args.kubeconfig.unwrap_or_else(|| own.join("config")),
+            advertise: args.advertise,
+        }
+    }
+}
+
+impl Config {
+    /// The host that people and agents should dial for a controller bound to `address`.
+    #[must_use]
+    pub fn host(&self, address: SocketAddr) -> String {
+        if let Some(first) = self.advertise.first() {
+            return first.clone();
+        }
+        if address.ip().is_unspecified() {
+            "127.0.0.1".to_owned()
+        } else {
+            address.ip().to_string()
+        }
+    }
+}

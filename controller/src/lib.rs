@@ -1,0 +1,30 @@
+//! The muster controller: the store, the API, agent sessions and the reconcilers.
+//!
+//! | module | is |
+//! |---|---|
+//! | [`app`] | starts, joins and ends everything |
+//! | [`config`] | flags and their defaults |
+//! | [`context`] | what the parts share |
+//! | [`store`] | revisioned objects, durable writes, watches |
+//! | [`rest`] | Kubernetes API conventions over the store |
+//! | [`session`] | agents: who is connected, what each should run, what each says |
+//! | [`reconcile`] | level-triggered loops: scheduling, health, deletion, garbage |
+//! | [`pki`], [`auth`] | certificates; who asks and whether they may |
+//! | [`events`], [`objects`] | Event objects; typed reading and writing of the kinds |
+//! | `serve` | the TLS port |
+//! | `kubeconfig`, `metrics` | the admin's credential file; the Prometheus recorder |
+
+pub mod app;
+pub mod auth;
+pub mod config;
+pub mod context;
+pub mod events;
+mod kubeconfig;
+mod metrics;
+pub mod objects;
+pub mod pki;
+pub mod reconcile;
+pub mod rest;
+mod serve;
+pub mod session;
+pub mod store;

@@ -1,0 +1,30 @@
+//! `muster-controller`: flags, logs and signals; everything else is in the library.
+
+use std::process::ExitCode;
+
+use clap::Parser;
+use muster_controller::app;
+use muster_controller::config::{Args, Config};
+use tracing_subscriber::EnvFilter;
+
+/// The muster controller: the store, the API and the placement of a robotcenter.
+#[derive(Debug, Parser)]
+#[command(version, about)]
+struct Cli {
+    #[command(flatten)]
+    args: Args,
+}
+
+#[tokio::main]
+async fn main() -> ExitCode {
+    let cli = Cli::parse();
+    let filter = EnvFilter::try_from_env("MUSTER_LOG").unwrap_or_else(|_| EnvFilter::new("info"));
+    tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).init();
+    match app::run(Config::from(cli.args), app::signal()).await {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("error: {}", app::chain(&error));
+            ExitCode::FAILURE
+        }
+    }
+}

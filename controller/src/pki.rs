@@ -1,0 +1,385 @@
+//! The controller's own certificate authority: made at the first start, kept in the data directory.
+//!
+//! ```text
+//! DIR/pki/ca.crt ca.key          ten years; its SHA-256 is part of every join token
+//! DIR/pki/server.crt server.key  presented as leaf + CA; made anew when names change or it nears its end
+//! DIR/pki/admin.crt admin.key    O=muster:admins, what the kubeconfig holds
+//! ```
+//! A key is written before its certificate, and only a certificate makes a pair count, so a crash in between leaves
+//! nothing half-made. Agents get `O=muster:nodes, CN=muster:node:NAME`: of their request only the key is used.
+
+use std::collections::BTreeSet;
+use std::fs::{self, File, OpenOptions};
+use std::io::{self, Write as _};
+use std::net::IpAddr;
+use std::os::unix::fs::{DirBuilderExt as _, OpenOptionsExt as _};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use jiff::{Span, Timestamp, tz::TimeZone};
+use rcgen::{
+    BasicConstraints, CertificateParams, CertificateSigningRequestParams, DistinguishedName,
+    DnType, ExtendedKeyUsagePurpose, IsCa, Issuer, KeyPair, KeyUsagePurpose,
+};
+use rustls::pki_types::pem::PemObject as _;
+use rustls::pki_types::{CertificateDer, PrivateKeyDer};
+use rustls::server::WebPkiClientVerifier;
+use rustls::{RootCertStore, ServerConfig};
+use x509_parser::extensions::GeneralName;
+
+/// `O` of administrators.
+pub const ADMINS: &str = "muster:admins";
+/// `O` of agents.
+pub const NODES: &str = "muster:nodes";
+/// What the `CN` of an agent begins with; the node's name follows.
+pub const NODE_PREFIX: &str = "muster:node:";
+
+const CA_DAYS: i64 = 3650;
+const LEAF_DAYS: i64 = 365;
+/// A certificate that ends sooner than this is made anew at start.
+const RENEW_DAYS: i64 = 30;
+
+/// Why certificates could not be made or read.
+#[derive(Debug, thiserror::Error)]
+pub enum PkiError {
+    /// A file could not be read or written.
+    #[error("cannot access {}", path.display())]
+    File {
+        /// Which.
+        path: PathBuf,
+        /// Why.
+        #[source]
+        source: io::Error,
+    },
+    /// A file does not hold what it should.
+    #[error("{} does not hold a usable certificate or key", path.display())]
+    Damaged {
+        /// Which.
+        path: PathBuf,
+    },
+    /// A certificate could not be made.
+    #[error("cannot make a certificate")]
+    Make(#[from] rcgen::Error),
+    /// TLS does not take what was made.
+    #[error("cannot set up TLS")]
+    Tls(#[from] rustls::Error),
+    /// The client verifier does not take the CA.
+    #[error("cannot verify client certificates")]
+    Verifier(#[from] rustls::server::VerifierBuilderError),
+}
+
+/// A certificate and its key, both as PEM.
+#[derive(Clone)]
+pub(crate) struct Pem {
+    pub(crate) certificate: String,
+    pub(crate) key: String,
+}
+
+/// The certificate authority.
+pub struct Pki {
+    dir: PathBuf,
+    ca: String,
+    ca_der: CertificateDer<'static>,
+    issuer: Issuer<'static, KeyPair>,
+}
+
+impl std::fmt::Debug for Pki {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Pki").field("dir", &self.dir).finish_non_exhaustive()
+    }
+}
+
+impl Pki {
+    /// Opens the authority in `dir`, or makes it.
+    pub(crate) fn open(dir: &Path, now: Timestamp) -> Result<Self, PkiError> {
+        let failed = |source| PkiError::File { path: dir.to_owned(), source };
+        fs::DirBuilder::new().recursive(true).mode(0o700).create(dir).map_err(failed)?;
+        let pair = match read_pair(dir, "ca")? {
+            Some(pair) => pair,
+            None => make_ca(dir, now)?,
+        };
+        let damaged = || PkiError::Damaged { path: dir.join("ca.crt") };
+        let key = KeyPair::from_pem(&pair.key).map_err(|_| damaged())?;
+        let issuer = Issuer::from_ca_cert_pem(&pair.certificate, key).map_err(|_| damaged())?;
+        let ca_der =
+            CertificateDer::from_pem_slice(pair.certificate.as_bytes()).map_err(|_| damaged())?;
+        Ok(Self { dir: dir.to_owned(), ca: pair.certificate, ca_der, issuer })
+    }
+
+    /// The CA's certificate as PEM.
+    #[must_use]
+    pub fn ca(&self) -> &str {
+        &self.ca
+    }
+
+    /// SHA-256 of the CA's certificate (DER), in hex: what a join token carries.
+    #[must_use]
+    pub fn ca_hash(&self) -> String {
+        hex(ring::digest::digest(&ring::digest::SHA256, &self.ca_der).as_ref())
+    }
+
+    /// The administrator's certificate, made anew when it nears its end.
+    pub(crate) fn admin(&self, now: Timestamp) -> Result<Pem, PkiError> {
+        self.keep("admin", now, |_| true, || client_params("admin", ADMINS, now))
+    }
+
+    /// TLS for the one port. `names` are the names and addresses that clients may dial.
+    pub(crate) fn server_config(
+        &self,
+        names: &BTreeSet<String>,
+        now: Timestamp,
+    ) -> Result<ServerConfig, PkiError> {
+        let fits = |present: &BTreeSet<String>| present == names;
+        let pair = self.keep("server", now, fits, || server_params(names, now))?;
+        let damaged = || PkiError::Damaged { path: self.dir.join("server.crt") };
+        let leaf =
+            CertificateDer::from_pem_slice(pair.certificate.as_bytes()).map_err(|_| damaged())?;
+        let key = PrivateKeyDer::from_pem_slice(pair.key.as_bytes()).map_err(|_| damaged())?;
+        let provider = Arc::new(rustls::crypto::ring::default_provider());
+        let mut roots = RootCertStore::empty();
+        roots.add(self.ca_der.clone())?;
+        let verifier =
+            WebPkiClientVerifier::builder_with_provider(Arc::new(roots), Arc::clone(&provider))
+                .allow_unauthenticated()
+                .build()?;
+        let mut config = ServerConfig::builder_with_provider(provider)
+            .with_protocol_versions(&[&rustls::version::TLS13])?
+            .with_client_cert_verifier(verifier)
+            // The CA goes along so that a joining agent can hold it against the hash in its token.
+            .with_single_cert(vec![leaf, self.ca_der.clone()], key)?;
+        config.alpn_protocols = vec![b"h2".to_vec(), b"http/1.1".to_vec()];
+        Ok(config)
+    }
+
+    /// Signs the key in an agent's request for the node `name`; everything else in the request is ignored.
+    ///
+    /// # Errors
+    /// [`PkiError::Make`] when the request cannot be read or its signature is wrong.
+    pub fn sign_node(&self, name: &str, csr: &str, now: Timestamp) -> Result<String, PkiError> {
+        let public_key = CertificateSigningRequestParams::from_pem(csr)?.public_key;
+        let params = client_params(&format!("{NODE_PREFIX}{name}"), NODES, now)?;
+        let signed =
+            CertificateSigningRequestParams { params, public_key }.signed_by(&self.issuer)?;
+        Ok(signed.pem())
+    }
+
+    /// The pair `name`, made anew when it is missing, nears its end or does not fit.
+    fn keep(
+        &self,
+        name: &str,
+        now: Timestamp,
+        fits: impl Fn(&BTreeSet<String>) -> bool,
+        params: impl Fn() -> Result<CertificateParams, PkiError>,
+    ) -> Result<Pem, PkiError> {
+        if let Some(pair) = read_pair(&self.dir, name)?
+            && let Some((names, ends)) = inspect(&pair.certificate)
+            && ends - now.as_second() > RENEW_DAYS * 86_400
+            && fits(&names)
+        {
+            return Ok(pair);
+        }
+        let key = KeyPair::generate()?;
+        let certificate = params()?.signed_by(&key, &self.issuer)?;
+        let pair = Pem { certificate: certificate.pem(), key: key.serialize_pem() };
+        write_pair(&self.dir, name, &pair)?;
+        Ok(pair)
+    }
+}
+
+fn make_ca(dir: &Path, now: Timestamp) -> Result<Pem, PkiError> {
+    let mut params = valid(CertificateParams::default(), now, CA_DAYS);
+    params.distinguished_name = subject("muster", "muster");
+    params.is_ca = IsCa::Ca(BasicConstraints::Constrained(0));
+    params.key_usages = vec![KeyUsagePurpose::KeyCertSign, KeyUsagePurpose::DigitalSignature];
+    let key = KeyPair::generate()?;
+    let pair = Pem { certificate: params.self_signed(&key)?.pem(), key: key.serialize_pem() };
+    write_pair(dir, "ca", &pair)?;
+    Ok(pair)
+}
+
+fn client_params(cn: &str, o: &str, now: Timestamp) -> Result<CertificateParams, PkiError> {
+    let mut params = valid(CertificateParams::default(), now, LEAF_DAYS);
+    params.distinguished_name = subject(cn, o);
+    params.key_usages = vec![KeyUsagePurpose::DigitalSignature];
+    params.extended_key_usages = vec![ExtendedKeyUsagePurpose::ClientAuth];
+    params.use_authority_key_identifier_extension = true;
+    Ok(params)
+}
+
+fn server_params(names: &BTreeSet<String>, now: Timestamp) -> Result<CertificateParams, PkiError> {
+    let names: Vec<String> = names.iter().cloned().collect();
+    let mut params = valid(CertificateParams::new(names)?, now, LEAF_DAYS);
+    params.distinguished_name = subject("muster-controller", "muster");
+    params.key_usages = vec![KeyUsagePurpose::DigitalSignature];
+    params.extended_key_usages = vec![ExtendedKeyUsagePurpose::ServerAuth];
+    params.use_authority_key_identifier_extension = true;
+    Ok(params)
+}
+
+fn subject(cn: &str, o: &str) -> DistinguishedName {
+    let mut name = DistinguishedName::new();
+    name.push(DnType::OrganizationName, o);
+    name.push(DnType::CommonName, cn);
+    name
+}
+
+/// Valid from the day before, so that an agent whose clock is a little behind can still join.
+fn valid(mut params: CertificateParams, now: Timestamp, days: i64) -> CertificateParams {
+    let day = |offset: i64| {
+        let date = now.to_zoned(TimeZone::UTC).date().saturating_add(Span::new().days(offset));
+        let part = |n: i8| u8::try_from(n).expect("months and days are positive");
+        rcgen::date_time_ymd(date.year().into(), part(date.month()), part(date.day()))
+    };
+    params.not_before = day(-1);
+    params.not_after = day(days);
+    params
+}
+
+/// The alternative names of a certificate and when it ends (seconds since the epoch).
+fn inspect(pem: &str) -> Option<(BTreeSet<String>, i64)> {
+    let der = CertificateDer::from_pem_slice(pem.as_bytes()).ok()?;
+    let (_, certificate) = x509_parser::parse_x509_certificate(&der).ok()?;
+    let names = certificate.subject_alternative_name().ok().flatten();
+    let names =
+        names.iter().flat_map(|names| &names.value.general_names).filter_map(|name| match name {
+            GeneralName::DNSName(name) => Some((*name).to_owned()),
+            GeneralName::IPAddress(bytes) => match bytes.len() {
+                4 => <[u8; 4]>::try_from(*bytes).ok().map(|a| IpAddr::from(a).to_string()),
+                _ => <[u8; 16]>::try_from(*bytes).ok().map(|a| IpAddr::from(a).to_string()),
+            },
+            _ => None,
+        });
+    Some((names.collect(), certificate.validity().not_after.timestamp()))
+}
+
+fn read_pair(dir: &Path, name: &str) -> Result<Option<Pem>, PkiError> {
+    let Some(certificate) = read(&dir.join(format!("{name}.crt")))? else { return Ok(None) };
+    let path = dir.join(format!("{name}.key"));
+    let Some(key) = read(&path)? else { return Err(PkiError::Damaged { path }) };
+    Ok(Some(Pem { certificate, key }))
+}
+
+fn read(path: &Path) -> Result<Option<String>, PkiError> {
+    match fs::read_to_string(path) {
+        Ok(text) => Ok(Some(text)),
+        Err(source) if source.kind() == io::ErrorKind::NotFound => Ok(None),
+        Err(source) => Err(PkiError::File { path: path.to_owned(), source }),
+    }
+}
+
+fn write_pair(dir: &Path, name: &str, pair: &Pem) -> Result<(), PkiError> {
+    // An old certificate beside the new key would be a pair that does not fit.
+    let certificate = dir.join(format!("{name}.crt"));
+    match fs::remove_file(&certificate) {
+        Err(source) if source.kind() != io::ErrorKind::NotFound => {
+            return Err(PkiError::File { path: certificate, source });
+        }
+        _ => {}
+    }
+    write_private(&dir.join(format!("{name}.key")), pair.key.as_bytes())?;
+    write_private(&certificate, pair.certificate.as_bytes())
+}
+
+/// Writes a file whole or not at all, readable by its owner only.
+pub(crate) fn write_private(path: &Path, bytes: &[u8]) -> Result<(), PkiError> {
+    let failed = |source| PkiError::File { path: path.to_owned(), source };
+    let parent = path.parent().filter(|dir| !dir.as_os_str().is_empty());
+    let dir = parent.unwrap_or_else(|| Path::new("."));
+    fs::DirBuilder::new().recursive(true).mode(0o700).create(dir).map_err(failed)?;
+    let mut temporary = path.as_os_str().to_owned();
+    temporary.push(format!(".{}.tmp", std::process::id()));
+    let temporary = PathBuf::from(temporary);
+    let write = || -> io::Result<()> {
+        let mut file = OpenOptions::new()
+            .write(true)
+            .create(true)
+            .truncate(true)
+            .mode(0o600)
+            .open(&temporary)?;
+        file.write_all(bytes)?;
+        file.sync_all()?;
+        fs::rename(&temporary, path)?;
+        File::open(dir)?.sync_all()
+    };
+    write().map_err(|source| {
+        // What is left of a failed write is of no use, and the failure is what the caller must hear of.
+        drop(fs::remove_file(&temporary));
+        failed(source)
+    })
+}
+
+/// Lower-case hex.
+pub(crate) fn hex(bytes: &[u8]) -> String {
+    bytes.iter().map(|byte| format!("{byte:02x}")).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn now() -> Timestamp {
+        "2026-11-22T12:00:00Z".parse().unwrap()
+    }
+
+    fn names(names: &[&str]) -> BTreeSet<String> {
+        names.iter().map(|name| (*name).to_owned()).collect()
+    }
+
+    #[test]
+    fn pairs_are_kept_until_they_near_their_end_or_names_change() {
+        let dir = tempfile::tempdir().unwrap();
+        let pki = Pki::open(dir.path(), now()).unwrap();
+        let first = pki.admin(now()).unwrap();
+        let again = Pki::open(dir.path(), now()).unwrap();
+        assert_eq!(again.ca_hash(), pki.ca_hash());
+        assert_eq!(again.admin(now()).unwrap().certificate, first.certificate);
+        let late = now() + jiff::SignedDuration::from_hours(24 * (LEAF_DAYS - RENEW_DAYS + 1));
+        assert_ne!(again.admin(late).unwrap().certificate, first.certificate);
+
+        let server = || fs::read_to_string(dir.path().join("server.crt")).unwrap();
+        pki.server_config(&names(&["localhost", "127.0.0.1", "::1"]), now()).unwrap();
+        let one = server();
+        pki.server_config(&names(&["localhost", "127.0.0.1", "::1"]), now()).unwrap();
+        assert_eq!(server(), one);
+        pki.server_config(&names(&["localhost", "127.0.0.1", "::1", "lab.example"]), now())
+            .unwrap();
+        assert_ne!(server(), one);
+    }
+
+    #[test]
+    fn keys_are_for_their_owner_only() {
+        use std::os::unix::fs::PermissionsExt as _;
+        let dir = tempfile::tempdir().unwrap();
+        Pki::open(dir.path(), now()).unwrap();
+        let mode = fs::metadata(dir.path().join("ca.key")).unwrap().permissions().mode();
+        assert_eq!(mode & 0o777, 0o600);
+    }
+
+    #[test]
+    fn a_key_without_its_certificate_is_made_anew() {
+        let dir = tempfile::tempdir().unwrap();
+        let pki = Pki::open(dir.path(), now()).unwrap();
+        pki.admin(now()).unwrap();
+        fs::remove_file(dir.path().join("admin.crt")).unwrap();
+        pki.admin(now()).unwrap();
+        fs::remove_file(dir.path().join("admin.key")).unwrap();
+        assert!(matches!(pki.admin(now()), Err(PkiError::Damaged { .. })));
+    }
+
+    #[test]
+    fn of_a_request_only_the_key_is_used() {
+        let dir = tempfile::tempdir().unwrap();
+        let pki = Pki::open(dir.path(), now()).unwrap();
+        let key = KeyPair::generate().unwrap();
+        let mut wish = CertificateParams::new(vec!["evil.example".to_owned()]).unwrap();
+        wish.distinguished_name = subject("admin", ADMINS);
+        let csr = wish.serialize_request(&key).unwrap().pem().unwrap();
+        let pem = pki.sign_node("turtlebot-1", &csr, now()).unwrap();
+        let der = CertificateDer::from_pem_slice(pem.as_bytes()).unwrap();
+        let (_, certificate) = x509_parser::parse_x509_certificate(&der).unwrap();
+        assert_eq!(certificate.subject().to_string(), "O=muster:nodes, CN=muster:node:turtlebot-1");
+        assert!(certificate.subject_alternative_name().unwrap().is_none());
+        assert!(!certificate.is_ca());
+        assert!(pki.sign_node("x", "not a request", now()).is_err());
+    }
+}

@@ -1,0 +1,178 @@
+//! Deletes what lost its owner (`metadata.ownerReferences`), and finishes deletions that wait for
+//! dependents: `propagationPolicy` Foreground and Orphan put a finalizer on the owner, and this loop
+//! takes it off when its condition holds.
+//!
+//! It keeps uids and references of everything in memory, fed by the store; an object goes when it
+//! names owners and none of them lives. A reference to something that never existed is as good as one
+//! to something that is gone, as in Kubernetes.
+
+use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::sync::Arc;
+
+use serde_json::Value;
+
+use super::{RETRY, next_events, watch_from_now};
+use crate::context::Context;
+use crate::rest::delete::delete_object;
+use crate::store::{Change, Key, StoreError, Stored, UpdateError};
+
+const FOREGROUND: &str = "foregroundDeletion";
+const ORPHAN: &str = "orphan";
+
+#[derive(Debug, Default)]
+struct Graph {
+    /// Every live object.
+    live: HashMap<Box<str>, Key>,
+    /// Owners of each object that has some.
+    owners: BTreeMap<Key, BTreeSet<String>>,
+    /// Objects that name each owner.
+    dependents: HashMap<String, BTreeSet<Key>>,
+    /// Owners whose deletion waits for this loop.
+    waiting: BTreeMap<Key, Box<str>>,
+}
+
+impl Graph {
+    fn take_in(&mut self, change: Change, stored: &Stored) {
+        for owner in self.owners.remove(&stored.key).into_iter().flatten() {
+            if let Some(keys) = self.dependents.get_mut(&owner) {
+                keys.remove(&stored.key);
+            }
+        }
+        self.waiting.remove(&stored.key);
+        if change == Change::Delete {
+            self.live.remove(&stored.uid);
+            return;
+        }
+        if stored.uid.is_empty() {
+            return;
+        }
+        self.live.insert(stored.uid.clone(), stored.key.clone());
+        // Most objects have neither; looking for the words spares reading the JSON.
+        let mentions = |word: &[u8]| stored.bytes.windows(word.len()).any(|w| w == word);
+        if mentions(b"\"ownerReferences\"") {
+            let owners = owner_uids(&stored.value());
+            for owner in &owners {
+                self.dependents.entry(owner.clone()).or_default().insert(stored.key.clone());
+            }
+            if !owners.is_empty() {
+                self.owners.insert(stored.key.clone(), owners);
+            }
+        }
+        if mentions(b"\"deletionTimestamp\"") && (mentions(FOREGROUND.as_bytes()) || mentions(ORPHAN.as_bytes())) {
+            self.waiting.insert(stored.key.clone(), stored.uid.clone());
+        }
+    }
+
+    fn lost(&self, key: &Key) -> bool {
+        self.owners.get(key).is_some_and(|owners| !owners.iter().any(|o| self.live.contains_key(o.as_str())))
+    }
+}
+
+fn owner_uids(object: &Value) -> BTreeSet<String> {
+    let references = object.pointer("/metadata/ownerReferences").and_then(Value::as_array);
+    references.into_iter().flatten().filter_map(|r| r["uid"].as_str().map(str::to_owned)).collect()
+}
+
+/// Works until dropped.
+pub async fn run(context: Arc<Context>) {
+    loop {
+        if let Err(error) = follow(&context).await {
+            tracing::warn!(error = crate::app::chain(&error), "garbage is not collected yet");
+            tokio::time::sleep(RETRY).await;
+        }
+    }
+}
+
+async fn follow(context: &Context) -> Result<(), StoreError> {
+    let mut watcher = watch_from_now(&context.store).await;
+    let mut graph = Graph::default();
+    for stored in context.store.list_all() {
+        graph.take_in(Change::Put, &stored);
+    }
+    let mut look: BTreeSet<Key> = graph.owners.keys().cloned().collect();
+    loop {
+        for key in std::mem::take(&mut look) {
+            if graph.lost(&key) && context.store.get(&key).is_some() {
+                tracing::info!(%key, "its owner is gone, deleting it");
+                // A refusal (it went already, it may not go) leaves nothing to do here.
+                drop(delete_object(context, &key).await);
+            }
+        }
+        for (key, uid) in graph.waiting.clone() {
+            finish(context, &graph, &key, &uid).await?;
+        }
+        let Some(events) = next_events(&mut watcher).await else { return Ok(()) };
+        for event in &events {
+            graph.take_in(event.change, &event.object);
+            match event.change {
+                Change::Put => {
+                    look.insert(event.object.key.clone());
+                }
+                Change::Delete => look.extend(graph.dependents.get(&*event.object.uid).into_iter().flatten().cloned()),
+            }
+        }
+    }
+}
+
+/// Does what a waiting deletion waits for, and takes the finalizer off when that is done.
+async fn finish(context: &Context, graph: &Graph, key: &Key, uid: &str) -> Result<(), StoreError> {
+    let Some(stored) = context.store.get(key) else { return Ok(()) };
+    let object = stored.value();
+    let has = |name: &str| {
+        object.pointer("/metadata/finalizers").and_then(Value::as_array).is_some_and(|f| f.iter().any(|x| x == name))
+    };
+    let dependents: Vec<&Key> = graph.dependents.get(uid).into_iter().flatten().collect();
+    if has(ORPHAN) {
+        for dependent in dependents {
+            update(context, dependent, |object| remove_reference(object, uid)).await?;
+        }
+        return update(context, key, |object| remove_finalizer(object, ORPHAN)).await;
+    }
+    if !has(FOREGROUND) {
+        return Ok(());
+    }
+    let mut left = 0;
+    for dependent in dependents {
+        if context.store.get(dependent).is_some() {
+            left += 1;
+            drop(delete_object(context, dependent).await);
+        }
+    }
+    if left == 0 { update(context, key, |object| remove_finalizer(object, FOREGROUND)).await } else { Ok(()) }
+}
+
+async fn update(context: &Context, key: &Key, change: impl Fn(&mut Value) -> bool + Send + Sync) -> Result<(), StoreError> {
+    let written = context
+        .store
+        .update(key, |_, mut object| Ok::<_, std::convert::Infallible>(change(&mut object).then_some(object)))
+        .await;
+    match written {
+        Ok(_) | Err(UpdateError::Store(StoreError::NotFound { .. })) => {}
+        Err(UpdateError::Store(error)) => return Err(error),
+        Err(UpdateError::Refused(never)) => match never {},
+    }
+    // With its last finalizer gone, a marked object goes; for a Task the deletion loop sees to it.
+    let last = context.store.get(key).map(|s| s.value());
+    let free = last.as_ref().is_some_and(|o| {
+        o.pointer("/metadata/deletionTimestamp").is_some()
+            && o.pointer("/metadata/finalizers").and_then(Value::as_array).is_none_or(Vec::is_empty)
+    });
+    if free {
+        drop(delete_object(context, key).await);
+    }
+    Ok(())
+}
+
+fn remove_finalizer(object: &mut Value, name: &str) -> bool {
+    let Some(list) = object.pointer_mut("/metadata/finalizers").and_then(Value::as_array_mut) else { return false };
+    let before = list.len();
+    list.retain(|f| f != name);
+    list.len() != before
+}
+
+fn remove_reference(object: &mut Value, uid: &str) -> bool {
+    let Some(list) = object.pointer_mut("/metadata/ownerReferences").and_then(Value::as_array_mut) else { return false };
+    let before = list.len();
+    list.retain(|r| r["uid"] != uid);
+    list.len() != before
+}

@@ -1,0 +1,40 @@
+//! Forgets what is old: Event objects after an hour, and history that no watch needs.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use jiff::Timestamp;
+
+use crate::context::Context;
+use crate::objects::EVENTS;
+use crate::store::Precondition;
+
+/// How long an Event stays; Kubernetes' default.
+const EVENT_LIFE: Duration = Duration::from_secs(3600);
+/// How often this looks.
+const EVERY: Duration = Duration::from_secs(60);
+/// Revisions that stay readable for watches that resume. At 100 writes/s this is the last 100 s,
+/// which a reconnecting client needs; at rest it is days.
+const KEEP_REVISIONS: u64 = 10_000;
+
+/// Works until dropped.
+pub async fn run(context: Arc<Context>) {
+    loop {
+        tokio::time::sleep(EVERY).await;
+        let now = context.clock.now();
+        for stored in context.store.list(EVENTS, None).items {
+            let value = stored.value();
+            let stamp = ["/lastTimestamp", "/metadata/creationTimestamp"]
+                .iter()
+                .find_map(|p| value.pointer(p)?.as_str()?.parse::<Timestamp>().ok());
+            let old = stamp.is_none_or(|s| now.duration_since(s).unsigned_abs() > EVENT_LIFE);
+            if old && let Err(error) = context.store.delete(stored.key.clone(), Precondition::revision(stored.revision)).await {
+                tracing::debug!(key = %stored.key, %error, "an old event is not removed yet");
+            }
+        }
+        let through = context.store.revision().saturating_sub(KEEP_REVISIONS);
+        if through > 0 && let Err(error) = context.store.compact(through).await {
+            tracing::warn!(error = crate::app::chain(&error), "history is not compacted");
+        }
+    }
+}

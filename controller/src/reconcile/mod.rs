@@ -1,0 +1,84 @@
+//! Level-triggered loops: each looks at what is and does what is missing. None depends on having
+//! seen an event; after a restart each begins by looking at everything.
+//!
+//! | loop | looks at | does |
+//! |---|---|---|
+//! | [`schedule`] | Nodes, Tasks, Leases | binds Pending tasks, or writes why not |
+//! | [`books`] | the scheduler's ledger | writes used, free and leases into Node status |
+//! | [`health`] | heartbeats | marks silent nodes and their tasks |
+//! | [`deletion`] | Tasks being deleted | removes those whose processes are gone |
+//! | [`garbage`] | ownerReferences | deletes what lost its owner |
+//! | [`history`] | Events, the store's history | forgets what is old |
+
+pub mod books;
+pub mod deletion;
+pub mod garbage;
+pub mod health;
+pub mod history;
+pub mod schedule;
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use tokio_util::task::TaskTracker;
+
+use crate::context::Context;
+use crate::session::Sessions;
+use crate::store::{Store, WatchEnd, WatchError, Watcher};
+
+/// How long a loop waits after the store failed before it tries again. Commits fail when the disk
+/// is full or broken; trying faster only fills the log.
+const RETRY: Duration = Duration::from_secs(1);
+
+/// What the rest of the controller may ask the loops.
+#[derive(Debug, Clone)]
+pub struct Reconcilers {
+    /// Questions to the scheduler.
+    pub scheduler: schedule::Handle,
+}
+
+/// Starts every loop; each ends when `context.stop` is cancelled.
+pub fn spawn(context: &Arc<Context>, sessions: &Arc<Sessions>, tasks: &TaskTracker) -> Reconcilers {
+    let books = Arc::new(books::Books::default());
+    let (scheduler, handle) = schedule::Scheduler::new(Arc::clone(context), Arc::clone(&books));
+    let loops = context.stop.clone();
+    let run = |name: &'static str, work: std::pin::Pin<Box<dyn Future<Output = ()> + Send>>| {
+        let stop = loops.clone();
+        tasks.spawn(async move {
+            tokio::select! {
+                () = stop.cancelled() => {}
+                () = work => tracing::debug!(name, "loop ended"),
+            }
+        });
+    };
+    run("schedule", Box::pin(scheduler.run()));
+    run("books", Box::pin(books::run(Arc::clone(context), books)));
+    run("health", Box::pin(health::run(Arc::clone(context), Arc::clone(sessions))));
+    run("deletion", Box::pin(deletion::run(Arc::clone(context))));
+    run("garbage", Box::pin(garbage::run(Arc::clone(context))));
+    run("history", Box::pin(history::run(Arc::clone(context))));
+    run("board", Box::pin(crate::session::board::run(Arc::clone(context), Arc::clone(sessions))));
+    Reconcilers { scheduler: handle }
+}
+
+/// The next changes of a watcher, or none when it must begin anew: it fell behind, and only a look
+/// at everything tells what it missed. Pending for ever when the store is shutting down.
+pub(crate) async fn next_events(watcher: &mut Watcher) -> Option<Vec<crate::store::Event>> {
+    match watcher.next().await {
+        Ok(events) => Some(events),
+        Err(WatchEnd::Expired(_)) => None,
+        Err(WatchEnd::Closed) => std::future::pending().await,
+    }
+}
+
+/// A watcher of everything from now. The caller lists after this call, so that nothing falls
+/// between; it sees some changes twice.
+pub(crate) async fn watch_from_now(store: &Store) -> Watcher {
+    loop {
+        match store.watch_all(store.revision()) {
+            Ok(watcher) => return watcher,
+            // Compaction may pass the revision between the two calls.
+            Err(WatchError::Expired(_) | WatchError::Ahead { .. }) => tokio::task::yield_now().await,
+        }
+    }
+}

@@ -1,0 +1,423 @@
+//! Feeds the pure scheduler from the store and carries its plans out.
+//!
+//! ```text
+//!   store.watch_all ──▶ take_in ──▶ Cluster + waiting tasks ──core::schedule──▶ Plan ──▶ transactions
+//!   questions (plan, why) ─────────────▲ answered from a copy, nothing is changed
+//! ```
+//!
+//! One task owns the cluster, so decisions are made one after the other. A bind is one transaction:
+//! the task's status and the lease it needs, each with the revision it was decided on. When it fails,
+//! the reservation is released and the store's next event brings the task back.
+
+use std::collections::HashMap;
+use std::sync::Arc;
+use std::time::Duration;
+
+use futures::future::join_all;
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::MicroTime;
+use muster_api::id::TaskUid;
+use muster_api::kind::lease::{Lease, LeaseHolder, LeaseSpec, LeaseStatus};
+use muster_api::kind::node::Node;
+use muster_api::kind::task::{NodeRefusal, Task, TaskLease, TaskSpec};
+use muster_api::name::NodeName;
+use muster_api::phase::TaskPhase;
+use muster_api::pose::Pose;
+use muster_controller_core::cluster::Cluster;
+use muster_controller_core::ledger::Reservation;
+use muster_controller_core::schedule::{self, Bind, Demand, Wait};
+use tokio::sync::{mpsc, oneshot};
+use tokio::time::Instant;
+
+use super::books::{Books, Page};
+use super::{RETRY, next_events, watch_from_now};
+use crate::context::Context;
+use crate::objects::{self, LEASES, NODES, TASKS};
+use crate::store::{Change, Event, Key, Op, Stored, Watcher};
+
+/// How often changed numbers in a waiting task's reasons are written. New reasons are written at
+/// once; a reason whose numbers move with every bind would write without end.
+const WHY_EVERY: Duration = Duration::from_secs(1);
+/// Reasons written in one pass, so that a thousand waiting tasks do not hold up the next bind.
+const WHY_AT_ONCE: usize = 256;
+
+/// A question to the scheduler.
+#[derive(Debug)]
+enum Question {
+    /// Where would these tasks go now?
+    Plan { tasks: Vec<Demand>, answer: oneshot::Sender<schedule::Plan> },
+    /// Why does this task wait? All nodes, not only those in its status.
+    Why { uid: TaskUid, spec: Arc<TaskSpec>, answer: oneshot::Sender<Vec<NodeRefusal>> },
+    /// A robot is somewhere else.
+    Pose { node: NodeName, pose: Pose },
+}
+
+/// Asks the scheduler.
+#[derive(Debug, Clone)]
+pub struct Handle {
+    questions: mpsc::Sender<Question>,
+}
+
+/// The scheduler has ended, because the controller ends.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[error("the scheduler has ended")]
+pub struct Ended;
+
+impl Handle {
+    /// What the real scheduler would decide for these tasks now, on a copy.
+    ///
+    /// # Errors
+    ///
+    /// When the controller ends.
+    pub async fn plan(&self, tasks: Vec<Demand>) -> Result<schedule::Plan, Ended> {
+        let (answer, answered) = oneshot::channel();
+        self.questions.send(Question::Plan { tasks, answer }).await.map_err(|_| Ended)?;
+        answered.await.map_err(|_| Ended)
+    }
+
+    /// Why no node takes a task, every node named.
+    ///
+    /// # Errors
+    ///
+    /// When the controller ends.
+    pub async fn why(&self, uid: TaskUid, spec: Arc<TaskSpec>) -> Result<Vec<NodeRefusal>, Ended> {
+        let (answer, answered) = oneshot::channel();
+        self.questions.send(Question::Why { uid, spec, answer }).await.map_err(|_| Ended)?;
+        answered.await.map_err(|_| Ended)
+    }
+
+    /// Says where a robot is now. Lost when the scheduler is busy: the next pose comes soon.
+    pub fn pose(&self, node: NodeName, pose: Pose) {
+        // A full queue means poses come faster than they are taken in; newer ones follow.
+        drop(self.questions.try_send(Question::Pose { node, pose }));
+    }
+}
+
+/// A task without a place.
+#[derive(Debug)]
+struct Waiting {
+    demand: Demand,
+    stored: Arc<Stored>,
+    /// What its status says.
+    written: Vec<NodeRefusal>,
+    written_at: Instant,
+}
+
+/// The one task that places tasks.
+#[derive(Debug)]
+pub struct Scheduler {
+    context: Arc<Context>,
+    books: Arc<Books>,
+    questions: mpsc::Receiver<Question>,
+    cluster: Cluster,
+    waiting: HashMap<TaskUid, Waiting>,
+    /// Nodes whose books changed since the last pass.
+    dirty: std::collections::BTreeSet<NodeName>,
+}
+
+impl Scheduler {
+    /// A scheduler that knows nothing yet, and the handle to ask it.
+    #[must_use]
+    pub fn new(context: Arc<Context>, books: Arc<Books>) -> (Self, Handle) {
+        // Questions are answered within a pass; 1024 poses are what 100 robots send in a second.
+        let (sender, questions) = mpsc::channel(1024);
+        let scheduler = Scheduler {
+            context,
+            books,
+            questions,
+            cluster: Cluster::new(),
+            waiting: HashMap::new(),
+            dirty: std::collections::BTreeSet::new(),
+        };
+        (scheduler, Handle { questions: sender })
+    }
+
+    /// Works until dropped.
+    pub async fn run(mut self) {
+        let mut watcher = self.rebuild().await;
+        loop {
+            let look_again = self.pass().await;
+            tokio::select! {
+                // Cancel safe: events that were not returned are returned by the next call.
+                events = next_events(&mut watcher) => match events {
+                    Some(events) => self.take_in_all(&mut watcher, events),
+                    None => watcher = self.rebuild().await,
+                },
+                // Cancel safe: a question that was not received stays in the channel.
+                Some(question) = self.questions.recv() => self.answer(question),
+                () = sleep_until(look_again) => {}
+            }
+        }
+    }
+
+    /// Looks at everything.
+    async fn rebuild(&mut self) -> Watcher {
+        let watcher = watch_from_now(&self.context.store).await;
+        self.cluster = Cluster::new();
+        self.waiting.clear();
+        for resource in [NODES, LEASES, TASKS] {
+            for stored in self.context.store.list(resource, None).items {
+                self.take_in(resource, Change::Put, &stored);
+            }
+        }
+        tracing::info!(nodes = self.cluster.members().count(), waiting = self.waiting.len(), "scheduler is up to date");
+        watcher
+    }
+
+    fn take_in_all(&mut self, watcher: &mut Watcher, mut events: Vec<Event>) {
+        loop {
+            for event in &events {
+                self.take_in(event.object.key.resource, event.change, &event.object);
+            }
+            // One pass serves everything that is there already.
+            match watcher.take() {
+                Ok(more) if !more.is_empty() => events = more,
+                // Fallen behind: the next call of `next` says so.
+                Ok(_) | Err(_) => return,
+            }
+        }
+    }
+
+    fn take_in(&mut self, resource: crate::store::Resource, change: Change, stored: &Arc<Stored>) {
+        if resource == TASKS {
+            self.take_in_task(change, stored);
+        } else if resource == NODES {
+            self.take_in_node(change, stored);
+        } else if resource == LEASES && change == Change::Put {
+            let Some(lease) = objects::read::<Lease>(stored) else { return };
+            let Ok(node) = NodeName::new(lease.spec.node.clone()) else { return };
+            let status = lease.status.unwrap_or_default();
+            self.cluster.set_lease(&node, &lease.spec.group, status.epoch, status.holder.map(|h| h.uid));
+        }
+    }
+
+    fn take_in_node(&mut self, change: Change, stored: &Arc<Stored>) {
+        let Ok(name) = NodeName::new(&*stored.key.name) else { return };
+        if change == Change::Delete {
+            self.cluster.remove_node(&name);
+            return;
+        }
+        let Some(node) = objects::read::<Node>(stored) else { return };
+        self.cluster.upsert_node(&name, &node);
+        let page = self.cluster.member(&name).map(|m| Page::from(&m.ledger));
+        if page.is_some_and(|p| !p.is_written(node.status.as_ref())) {
+            self.dirty.insert(name);
+        }
+    }
+
+    fn take_in_task(&mut self, change: Change, stored: &Arc<Stored>) {
+        let uid = TaskUid::new(&*stored.uid);
+        let task = (change == Change::Put).then(|| objects::read::<Task>(stored)).flatten();
+        let Some(task) = task else {
+            self.forget(&uid);
+            return;
+        };
+        let status = task.status.unwrap_or_default();
+        match (status.phase, status.node) {
+            (TaskPhase::Pending, _) if task.metadata.deletion_timestamp.is_none() => {
+                let since = self.waiting.get(&uid).map_or(stored.revision, |w| w.demand.since);
+                let title = format!("{}/{}", stored.key.namespace().unwrap_or_default(), stored.key.name);
+                let demand = Demand { uid: uid.clone(), title: title.into(), spec: Arc::new(task.spec), since };
+                let written_at = Instant::now();
+                self.waiting.insert(uid, Waiting { demand, stored: Arc::clone(stored), written: status.why, written_at });
+            }
+            (phase, Some(node)) if phase.holds_node() => {
+                self.waiting.remove(&uid);
+                let Ok(node) = NodeName::new(node) else { return };
+                let title = format!("{}/{}", stored.key.namespace().unwrap_or_default(), stored.key.name);
+                let compute = task.spec.resources.reserved();
+                // Which groups it holds is said by the Lease objects.
+                self.cluster.book(&uid, &node, Reservation { title: title.into(), compute, groups: Vec::new() });
+                self.dirty.insert(node);
+            }
+            _ => self.forget(&uid),
+        }
+    }
+
+    fn forget(&mut self, uid: &TaskUid) {
+        self.waiting.remove(uid);
+        self.dirty.extend(self.cluster.release(uid));
+    }
+
+    fn answer(&mut self, question: Question) {
+        // Nobody waits for an answer any more when its receiver is gone; that is no fault.
+        match question {
+            Question::Plan { mut tasks, answer } => {
+                drop(answer.send(schedule::schedule(&mut self.cluster.clone(), &mut tasks)));
+            }
+            Question::Why { uid, spec, answer } => {
+                let demand = Demand { uid, title: "".into(), spec, since: 0 };
+                let why = schedule::explain(&self.cluster, &demand);
+                drop(answer.send(why.iter().map(|(node, refusal)| refusal.of_node(node.as_str())).collect()));
+            }
+            Question::Pose { node, pose } => self.cluster.set_pose(&node, &pose),
+        }
+    }
+
+    /// Decides for everything that waits, and carries it out. Says when to look again even if
+    /// nothing changes.
+    async fn pass(&mut self) -> Option<Instant> {
+        let mut retry = None;
+        if !self.waiting.is_empty() {
+            let mut demands: Vec<Demand> = self.waiting.values().map(|w| w.demand.clone()).collect();
+            let plan = schedule::schedule(&mut self.cluster, &mut demands);
+            let binds = self.bind_all(plan.binds).await;
+            let waits = self.write_reasons(plan.waits).await;
+            retry = [binds, waits].into_iter().flatten().min();
+        }
+        for node in std::mem::take(&mut self.dirty) {
+            if let Some(member) = self.cluster.member(&node) {
+                self.books.put(&node, Page::from(&member.ledger));
+            }
+        }
+        retry
+    }
+
+    async fn bind_all(&mut self, binds: Vec<Bind>) -> Option<Instant> {
+        let transactions: Vec<Option<Vec<Op>>> = binds.iter().map(|bind| self.bind_ops(bind)).collect();
+        let store = &self.context.store;
+        let apply = |ops: Option<Vec<Op>>| async move {
+            match ops {
+                Some(ops) => Some(store.apply(ops).await),
+                None => None,
+            }
+        };
+        let results = join_all(transactions.into_iter().map(apply)).await;
+        let mut retry = None;
+        for (bind, result) in binds.into_iter().zip(results) {
+            match result {
+                Some(Ok(_)) => {
+                    tracing::info!(task = %bind.uid, node = %bind.node, score = bind.score, "bound");
+                    metrics::counter!("muster_binds_total").increment(1);
+                    self.waiting.remove(&bind.uid);
+                }
+                Some(Err(error)) => {
+                    self.cluster.release(&bind.uid);
+                    if objects::is_race(&error) {
+                        // What changed arrives as an event and brings the task back, if it still waits.
+                        tracing::debug!(task = %bind.uid, %error, "a bind came too late");
+                    } else {
+                        tracing::warn!(task = %bind.uid, error = crate::app::chain(&error), "a bind is not written");
+                        retry = Some(Instant::now() + RETRY);
+                    }
+                }
+                None => {
+                    self.cluster.release(&bind.uid);
+                    self.waiting.remove(&bind.uid);
+                }
+            }
+            self.dirty.insert(bind.node);
+        }
+        retry
+    }
+
+    /// The bind as one transaction. None: the stored task does not read as one.
+    fn bind_ops(&self, bind: &Bind) -> Option<Vec<Op>> {
+        let waiting = self.waiting.get(&bind.uid)?;
+        let mut task: Task = objects::read(&waiting.stored)?;
+        let now = MicroTime(self.context.clock.now());
+        let mut ops = Vec::with_capacity(2);
+        let status = task.status.get_or_insert_default();
+        status.phase = TaskPhase::Bound;
+        status.node = Some(bind.node.to_string());
+        status.score = bind.score;
+        status.why = Vec::new();
+        status.reason = String::new();
+        status.message = String::new();
+        status.bound_at = Some(now.clone());
+        status.lease = bind.leases.first().map(|(group, epoch)| TaskLease {
+            name: LeaseSpec::object_name(bind.node.as_str(), group),
+            epoch: *epoch,
+        });
+        ops.push(objects::replace(&waiting.stored, &task));
+        for (group, epoch) in &bind.leases {
+            let holder = LeaseHolder {
+                namespace: task.metadata.namespace.clone().unwrap_or_default(),
+                name: task.metadata.name.clone().unwrap_or_default(),
+                uid: bind.uid.clone(),
+            };
+            let status = LeaseStatus { epoch: *epoch, holder: Some(holder), acquired: Some(now.clone()), renewed: None };
+            ops.push(self.grant_op(bind.node.as_str(), group, status));
+        }
+        Some(ops)
+    }
+
+    fn grant_op(&self, node: &str, group: &str, status: LeaseStatus) -> Op {
+        let key: Key = objects::lease_key(node, group);
+        let present = self.context.store.get(&key);
+        if let Some((stored, mut lease)) = present.and_then(|s| objects::read::<Lease>(&s).map(|l| (s, l))) {
+            lease.status = Some(status);
+            return objects::replace(&stored, &lease);
+        }
+        let spec = LeaseSpec { node: node.to_owned(), group: group.to_owned(), actuators: Vec::new() };
+        let mut lease = Lease::new(&key.name, spec);
+        objects::stamp_new(&mut lease.metadata, self.context.clock.now());
+        lease.status = Some(status);
+        objects::create(key, &lease)
+    }
+
+    /// Writes why tasks wait, where it is not written yet.
+    async fn write_reasons(&mut self, waits: Vec<Wait>) -> Option<Instant> {
+        let now = Instant::now();
+        let mut later = None;
+        let mut due = Vec::new();
+        for Wait { uid, why } in waits {
+            let Some(waiting) = self.waiting.get(&uid).filter(|w| w.written != why) else { continue };
+            let at = waiting.written_at + WHY_EVERY;
+            if (same_reasons(&waiting.written, &why) && at > now) || due.len() == WHY_AT_ONCE {
+                let at = at.max(now + WHY_EVERY / 10);
+                later = Some(later.map_or(at, |l: Instant| l.min(at)));
+                continue;
+            }
+            due.push((waiting.stored.key.clone(), uid, why));
+        }
+        let store = &self.context.store;
+        join_all(due.into_iter().map(|(key, uid, why)| async move {
+            let written = objects::change(store, &key, |stored, mut task: Task| {
+                let status = task.status.get_or_insert_default();
+                if *stored.uid != *uid.as_str() || status.phase != TaskPhase::Pending || status.why == why {
+                    return None;
+                }
+                status.reason = "Unschedulable".to_owned();
+                status.message = headline(&why);
+                status.why.clone_from(&why);
+                Some(vec![objects::replace(stored, &task)])
+            });
+            if let Err(error) = written.await {
+                tracing::warn!(task = %key, error = crate::app::chain(&error), "a task's reasons are not written");
+            }
+        }))
+        .await;
+        later
+    }
+}
+
+/// The same nodes for the same reasons; numbers in the sentences may differ.
+fn same_reasons(a: &[NodeRefusal], b: &[NodeRefusal]) -> bool {
+    let of = |why: &[NodeRefusal]| -> Vec<(String, String)> {
+        why.iter().map(|w| (w.node.clone(), w.reason.clone())).collect()
+    };
+    of(a) == of(b)
+}
+
+/// The reasons in one line: how many nodes say what.
+fn headline(why: &[NodeRefusal]) -> String {
+    let mut counts: Vec<(&str, usize)> = Vec::new();
+    for refusal in why.iter().filter(|w| !w.node.is_empty()) {
+        match counts.iter_mut().find(|(reason, _)| *reason == refusal.reason) {
+            Some((_, n)) => *n += 1,
+            None => counts.push((&refusal.reason, 1)),
+        }
+    }
+    if counts.is_empty() {
+        return why.first().map(|w| w.message.clone()).unwrap_or_default();
+    }
+    let parts: Vec<String> = counts.iter().map(|(reason, n)| format!("{n} {reason}")).collect();
+    format!("no node takes it: {}", parts.join(", "))
+}
+
+async fn sleep_until(deadline: Option<Instant>) {
+    match deadline {
+        Some(deadline) => tokio::time::sleep_until(deadline).await,
+        None => std::future::pending().await,
+    }
+}

@@ -1,0 +1,66 @@
+//! Bodies: JSON only, of a limited size.
+
+use axum::body::Body;
+use bytes::Bytes;
+use http::{HeaderMap, StatusCode, header};
+use serde_json::Value;
+
+use super::failure::Failure;
+
+/// As much as Kubernetes takes.
+const LIMIT: usize = 3 << 20;
+
+/// The media type of the body without its parameters, in lower case.
+pub(super) fn media_type(headers: &HeaderMap) -> String {
+    let value = headers.get(header::CONTENT_TYPE).and_then(|value| value.to_str().ok());
+    let value = value.unwrap_or_default();
+    value.split(';').next().unwrap_or_default().trim().to_ascii_lowercase()
+}
+
+pub(super) fn unsupported(found: &str, supported: &str) -> Failure {
+    let message = format!(
+        "the body of the request was in an unknown format ({found:?}): accepted media types include: {supported}"
+    );
+    Failure::new(StatusCode::UNSUPPORTED_MEDIA_TYPE, "UnsupportedMediaType", message)
+}
+
+/// The whole body.
+pub(super) async fn bytes(body: Body) -> Result<Bytes, Failure> {
+    use http_body_util::{BodyExt as _, LengthLimitError, Limited};
+    match Limited::new(body, LIMIT).collect().await {
+        Ok(collected) => Ok(collected.to_bytes()),
+        Err(error) if error.downcast_ref::<LengthLimitError>().is_some() => Err(Failure::new(
+            StatusCode::PAYLOAD_TOO_LARGE,
+            "RequestEntityTooLarge",
+            format!("the body is larger than {LIMIT} bytes"),
+        )),
+        Err(error) => Err(Failure::bad_request(format!("cannot read the body: {error}"))),
+    }
+}
+
+/// A JSON body; a request that does not say what it sends is taken to send JSON.
+pub(super) async fn json(headers: &HeaderMap, body: Body) -> Result<Value, Failure> {
+    let found = media_type(headers);
+    if !matches!(found.as_str(), "" | "application/json") {
+        return Err(unsupported(&found, "application/json"));
+    }
+    parse(&bytes(body).await?)
+}
+
+/// A JSON body that may be left out.
+pub(super) async fn optional_json(headers: &HeaderMap, body: Body) -> Result<Value, Failure> {
+    let found = media_type(headers);
+    let bytes = bytes(body).await?;
+    if bytes.is_empty() {
+        return Ok(Value::Null);
+    }
+    if !matches!(found.as_str(), "" | "application/json") {
+        return Err(unsupported(&found, "application/json"));
+    }
+    parse(&bytes)
+}
+
+pub(super) fn parse(bytes: &[u8]) -> Result<Value, Failure> {
+    serde_json::from_slice(bytes)
+        .map_err(|error| Failure::bad_request(format!("the body is not JSON: {error}")))
+}

@@ -1,0 +1,176 @@
+//! POST: new objects.
+
+use std::sync::Arc;
+
+use axum::response::Response;
+use http::{HeaderValue, StatusCode, header};
+use serde_json::Value;
+
+use super::path::Object;
+use super::query::FieldValidation;
+use super::registry::Entry;
+use super::{Answer, Call, admission, body, failure::Failure, metadata, namespace};
+use crate::context::Context;
+use crate::store::{Op, Precondition, StoreError, Stored};
+
+/// Random letters after a `generateName`. No vowels and no look-alikes, as in Kubernetes.
+const SUFFIX: &[u8; 27] = b"bcdfghjklmnpqrstvwxz2456789";
+const SUFFIX_LENGTH: usize = 5;
+/// Names of five letters collide once in fourteen million; several times in a row is another fault.
+const ATTEMPTS: usize = 8;
+
+pub(super) async fn create(call: Call, target: Object) -> Answer {
+    if target.name.is_some() {
+        return Err(Failure::method(call.request.method()));
+    }
+    let (dry, mode) = (call.query.dry_run()?, call.query.field_validation()?);
+    let Call { context, request, .. } = call;
+    let (parts, body) = request.into_parts();
+    let object = body::json(&parts.headers, body).await?;
+    let request = New { entry: target.entry, namespace: target.namespace.as_deref(), mode, dry };
+    let (bytes, warnings) = store_new(&context, &request, object).await?;
+    Ok(with_warnings(super::raw(StatusCode::CREATED, bytes), warnings))
+}
+
+/// Creates an object in this process, with everything that a POST checks.
+///
+/// # Errors
+/// What a client would be told.
+pub async fn create_object(
+    context: &Context,
+    resource: crate::store::Resource,
+    object: Value,
+) -> Result<Arc<Stored>, Failure> {
+    let entry = super::registry::of(resource)
+        .ok_or_else(|| Failure::internal(format!("{resource} is not served")))?;
+    let namespace = metadata::text(&object, "namespace").map(str::to_owned);
+    let new =
+        New { entry, namespace: namespace.as_deref(), mode: FieldValidation::Strict, dry: false };
+    let prepared = prepare(context, &new, object)?;
+    commit(context, &new, prepared.object).await
+}
+
+/// What is asked for.
+struct New<'a> {
+    entry: &'static Entry,
+    namespace: Option<&'a str>,
+    mode: FieldValidation,
+    dry: bool,
+}
+
+async fn store_new(
+    context: &Context,
+    new: &New<'_>,
+    object: Value,
+) -> Result<(bytes::Bytes, Vec<HeaderValue>), Failure> {
+    let prepared = prepare(context, new, object)?;
+    if new.dry {
+        let name = metadata::text(&prepared.object, "name").unwrap_or_default();
+        if context.store.get(&new.entry.key(new.namespace, name)).is_some() {
+            return Err(Failure::already_exists(new.entry, name));
+        }
+        namespace::admit_into(context, new.entry, new.namespace, name)?;
+        return Ok((prepared.object.to_string().into(), prepared.warnings));
+    }
+    let stored = commit(context, new, prepared.object).await?;
+    Ok((stored.bytes.clone(), prepared.warnings))
+}
+
+/// The object as it would be stored.
+fn prepare(
+    context: &Context,
+    new: &New<'_>,
+    mut object: Value,
+) -> Result<admission::Admitted, Failure> {
+    let info = new.entry.info;
+    admission::identify(new.entry, &mut object)?;
+    if info.has_status
+        && let Some(fields) = object.as_object_mut()
+    {
+        fields.remove("status");
+    }
+    let Some(own) = metadata::of(&mut object) else {
+        return Err(Failure::bad_request("metadata is not a JSON object"));
+    };
+    if own.get("resourceVersion").and_then(Value::as_str).is_some_and(|rv| !rv.is_empty()) {
+        return Err(Failure::bad_request(
+            "resourceVersion should not be set on objects to be created",
+        ));
+    }
+    match (own.get("namespace").and_then(Value::as_str).filter(|ns| !ns.is_empty()), new.namespace)
+    {
+        (Some(body), Some(path)) if body != path => {
+            return Err(Failure::bad_request(format!(
+                "the namespace of the object ({body}) does not match the namespace of the request ({path})"
+            )));
+        }
+        (None, Some(path)) => {
+            own.insert("namespace".into(), path.into());
+        }
+        (None, None) if info.namespaced => {
+            return Err(Failure::bad_request("an object of this kind needs a namespace"));
+        }
+        _ => {}
+    }
+    metadata::begin(context, own, !info.group.is_empty());
+    if own.get("name").and_then(Value::as_str).is_none_or(str::is_empty)
+        && let Some(prefix) = own.get("generateName").and_then(Value::as_str)
+    {
+        let name = format!("{prefix}{}", suffix());
+        own.insert("name".into(), name.into());
+    }
+    let name = metadata::text(&object, "name").unwrap_or_default().to_owned();
+    let mut admitted = admission::admit(new.entry, &name, object, new.mode)?;
+    if info.kind == "Namespace" {
+        namespace::complete(&mut admitted.object);
+    }
+    Ok(admitted)
+}
+
+/// Stores it, in a namespace that is there and not ending at the moment of the commit.
+async fn commit(
+    context: &Context,
+    new: &New<'_>,
+    mut object: Value,
+) -> Result<Arc<Stored>, Failure> {
+    let prefix = metadata::text(&object, "generateName").map(str::to_owned);
+    for _ in 0..ATTEMPTS {
+        let name = metadata::text(&object, "name").unwrap_or_default().to_owned();
+        let key = new.entry.key(new.namespace, &name);
+        let guard = namespace::admit_into(context, new.entry, new.namespace, &name)?;
+        let mut ops: Vec<Op> = guard.into_iter().collect();
+        ops.push(Op::Put {
+            key: key.clone(),
+            value: object.clone(),
+            precondition: Precondition::Absent,
+        });
+        match context.store.apply(ops).await {
+            Ok(mut stored) => {
+                return stored.pop().ok_or_else(|| Failure::internal("nothing was stored"));
+            }
+            Err(StoreError::AlreadyExists { .. }) if prefix.is_some() => {
+                let prefix = prefix.as_deref().unwrap_or_default();
+                object["metadata"]["name"] = format!("{prefix}{}", suffix()).into();
+            }
+            // The namespace changed in between: look at it again.
+            Err(
+                StoreError::Conflict { key: changed, .. } | StoreError::NotFound { key: changed },
+            ) if changed != key => {}
+            Err(error) => return Err(Failure::of_store(new.entry, &name, &error)),
+        }
+    }
+    Err(Failure::unavailable("the namespace keeps changing"))
+}
+
+fn suffix() -> String {
+    let random = uuid::Uuid::new_v4();
+    let letters = random.as_bytes().iter().take(SUFFIX_LENGTH);
+    letters.map(|byte| char::from(SUFFIX[usize::from(*byte) % SUFFIX.len()])).collect()
+}
+
+pub(super) fn with_warnings(mut response: Response, warnings: Vec<HeaderValue>) -> Response {
+    for warning in warnings {
+        response.headers_mut().append(header::WARNING, warning);
+    }
+    response
+}

@@ -1,0 +1,262 @@
+//! DELETE: at once, or a wish that others fulfil.
+//!
+//! An object stays, with `deletionTimestamp`, while it has finalizers, and a Task also while it may have processes: the
+//! reconciler removes it once the agent has confirmed that they are gone. Even a grace of 0 only tells the agent to hurry:
+//! removing the object would free what the processes still use.
+
+use std::sync::Arc;
+
+use axum::response::Response;
+use http::StatusCode;
+use jiff::{SignedDuration, Timestamp};
+use muster_api::phase::TaskPhase;
+use serde::Deserialize;
+use serde_json::{Value, json};
+
+use super::path::Object;
+use super::registry::Entry;
+use super::selector::Selection;
+use super::{Answer, Call, body, failure::Failure, metadata};
+use crate::context::Context;
+use crate::store::{Key, Precondition, Resource, Store, StoreError, Stored};
+
+/// What a task gets that says nothing about it, s.
+const DEFAULT_GRACE: i64 = 10;
+
+/// `DeleteOptions`.
+#[derive(Debug, Clone, Default, Deserialize)]
+#[serde(rename_all = "camelCase", default)]
+struct Options {
+    grace_period_seconds: Option<i64>,
+    propagation_policy: Option<String>,
+    preconditions: Preconditions,
+    dry_run: Vec<String>,
+}
+
+#[derive(Debug, Clone, Default, Deserialize)]
+#[serde(rename_all = "camelCase", default)]
+struct Preconditions {
+    uid: Option<String>,
+    resource_version: Option<String>,
+}
+
+/// Whether the object must wait for somebody to confirm that what it stands for is over: a Task that was given to a
+/// node and has not ended.
+#[must_use]
+pub fn is_held(resource: Resource, object: &Value) -> bool {
+    if resource.as_str() != "tasks" {
+        return false;
+    }
+    let status = &object["status"];
+    let given = status["node"].as_str().is_some_and(|node| !node.is_empty());
+    let phase = serde_json::from_value::<TaskPhase>(status["phase"].clone());
+    given && !phase.is_ok_and(TaskPhase::is_terminal)
+}
+
+/// Deletes an object in this process, as a client's DELETE does: at once where nobody has to confirm anything.
+/// Returns the last state, or the state with its `deletionTimestamp`.
+///
+/// # Errors
+/// What a client would be told.
+pub async fn delete_object(context: &Context, key: &Key) -> Result<Arc<Stored>, Failure> {
+    let entry = super::registry::of(key.resource)
+        .ok_or_else(|| Failure::internal(format!("{} is not served", key.resource)))?;
+    match end(context, entry, key, &Options::default()).await? {
+        Ended::Gone(stored) | Ended::Waiting(stored) => Ok(stored),
+    }
+}
+
+pub(super) async fn delete(call: Call, target: Object) -> Answer {
+    let (context, options) = read(call).await?;
+    let key = target.key()?;
+    let ended = end(&context, target.entry, &key, &options).await?;
+    Ok(match ended {
+        Ended::Waiting(stored) => super::raw(StatusCode::OK, stored.bytes.clone()),
+        Ended::Gone(stored) => gone(target.entry, &stored),
+    })
+}
+
+pub(super) async fn collection(call: Call, target: Object) -> Answer {
+    let selection = Selection::read(target.entry, target.namespace.as_deref(), &call.query)?;
+    let (context, options) = read(call).await?;
+    let mut snapshot = context.store.list(target.entry.resource, target.namespace.as_deref());
+    snapshot.items.retain(|stored| selection.matches(stored));
+    for stored in &snapshot.items {
+        match end(&context, target.entry, &stored.key, &options).await {
+            Ok(_) => {}
+            // Somebody else was faster.
+            Err(failure) if failure.code() == 404 => {}
+            Err(failure) => return Err(failure),
+        }
+    }
+    let items: Vec<Value> = snapshot.items.iter().map(|stored| stored.value()).collect();
+    let info = target.entry.info;
+    let list = json!({
+        "kind": format!("{}List", info.kind),
+        "apiVersion": info.api_version(),
+        "metadata": {"resourceVersion": context.store.revision().to_string()},
+        "items": items,
+    });
+    Ok(super::json(StatusCode::OK, &list))
+}
+
+async fn read(call: Call) -> Result<(Arc<Context>, Options), Failure> {
+    let Call { context, query, request, .. } = call;
+    let dry = query.dry_run()?;
+    let (parts, body) = request.into_parts();
+    let body = body::optional_json(&parts.headers, body).await?;
+    let mut options: Options = match body {
+        Value::Null => Options::default(),
+        body => serde_json::from_value(body)
+            .map_err(|error| Failure::bad_request(format!("DeleteOptions: {error}")))?,
+    };
+    if let Some(grace) = query.parse("gracePeriodSeconds")? {
+        options.grace_period_seconds = Some(grace);
+    }
+    if let Some(policy) = query.text("propagationPolicy") {
+        options.propagation_policy = Some(policy.to_owned());
+    }
+    if dry {
+        options.dry_run = vec!["All".to_owned()];
+    }
+    if options.grace_period_seconds.is_some_and(|grace| grace < 0) {
+        return Err(Failure::bad_request("gracePeriodSeconds must not be negative"));
+    }
+    match options.propagation_policy.as_deref() {
+        None | Some("Background" | "Foreground" | "Orphan") => Ok((context, options)),
+        Some(other) => Err(Failure::bad_request(format!(
+            "propagationPolicy: {other:?} is not Background, Foreground or Orphan"
+        ))),
+    }
+}
+
+enum Ended {
+    /// The last state.
+    Gone(Arc<Stored>),
+    /// It has its `deletionTimestamp` and waits.
+    Waiting(Arc<Stored>),
+}
+
+async fn end(
+    context: &Context,
+    entry: &'static Entry,
+    key: &Key,
+    options: &Options,
+) -> Result<Ended, Failure> {
+    let name = &*key.name;
+    if entry.info.kind == "Namespace" && name == muster_api::kind::namespace::DEFAULT {
+        return Err(Failure::denied(format!(
+            "namespaces {name:?} is forbidden: this namespace may not be deleted"
+        ))
+        .about(entry, name));
+    }
+    loop {
+        let present = context.store.get(key).ok_or_else(|| Failure::not_found(entry, name))?;
+        check(entry, &present, &options.preconditions)?;
+        let object = present.value();
+        let finalizer = finalizer(options);
+        let waits = metadata::has_finalizers(&object)
+            || is_held(key.resource, &object)
+            || super::namespace::is_ours_to_end(entry)
+            || finalizer.is_some();
+        let wish = waits.then(|| wish(context.clock.now(), &object, options, finalizer));
+        if !options.dry_run.is_empty() {
+            return Ok(if waits { Ended::Waiting(present) } else { Ended::Gone(present) });
+        }
+        let ended = match wish {
+            None => remove(&context.store, &present).await.map(Ended::Gone),
+            // It already ends, and no sooner for this.
+            Some(wish) if wish == object => return Ok(Ended::Waiting(present)),
+            Some(wish) => {
+                let precondition = Precondition::revision(present.revision);
+                context.store.put(key.clone(), wish, precondition).await.map(Ended::Waiting)
+            }
+        };
+        match ended {
+            Ok(ended) => return Ok(ended),
+            Err(StoreError::Conflict { .. }) => {}
+            Err(error) => return Err(Failure::of_store(entry, name, &error)),
+        }
+    }
+}
+
+async fn remove(store: &Store, present: &Stored) -> Result<Arc<Stored>, StoreError> {
+    store.delete(present.key.clone(), Precondition::revision(present.revision)).await
+}
+
+/// Who has to act before the object goes, because of how it is deleted.
+fn finalizer(options: &Options) -> Option<&'static str> {
+    match options.propagation_policy.as_deref() {
+        Some("Foreground") => Some("foregroundDeletion"),
+        Some("Orphan") => Some("orphan"),
+        _ => None,
+    }
+}
+
+fn check(entry: &Entry, present: &Stored, preconditions: &Preconditions) -> Result<(), Failure> {
+    let name = &*present.key.name;
+    if let Some(uid) = &preconditions.uid
+        && **uid != *present.uid
+    {
+        let why = format!(
+            "Precondition failed: UID in precondition: {uid}, UID in object meta: {}",
+            present.uid
+        );
+        return Err(Failure::conflict(entry, name, why));
+    }
+    if let Some(version) = &preconditions.resource_version
+        && *version != present.revision.to_string()
+    {
+        let why = format!(
+            "Precondition failed: ResourceVersion in precondition: {version}, ResourceVersion in object meta: {}",
+            present.revision
+        );
+        return Err(Failure::conflict(entry, name, why));
+    }
+    Ok(())
+}
+
+/// The object with the wish that it goes. Asked again, the end can come sooner, not later.
+fn wish(now: Timestamp, object: &Value, options: &Options, finalizer: Option<&str>) -> Value {
+    let mut object = object.clone();
+    let own = &object["spec"]["gracePeriodSeconds"];
+    let grace = options.grace_period_seconds.or_else(|| own.as_i64()).unwrap_or(DEFAULT_GRACE);
+    let grace = if object["kind"] == "Task" { grace } else { 0 };
+    let at = now.saturating_add(SignedDuration::from_secs(grace)).unwrap_or(Timestamp::MAX);
+    let present = object["metadata"]["deletionTimestamp"].as_str();
+    let present = present.and_then(|text| text.parse::<Timestamp>().ok());
+    let sooner = match present {
+        None => true,
+        Some(present) => options.grace_period_seconds.is_some() && at < present,
+    };
+    if sooner {
+        let text = at.strftime("%Y-%m-%dT%H:%M:%SZ").to_string();
+        object["metadata"]["deletionTimestamp"] = text.into();
+        object["metadata"]["deletionGracePeriodSeconds"] = grace.into();
+        super::namespace::terminate(&mut object);
+    }
+    if let Some(finalizer) = finalizer.filter(|_| present.is_none()) {
+        let mut list = object["metadata"]["finalizers"].as_array().cloned().unwrap_or_default();
+        if !list.iter().any(|present| present == finalizer) {
+            list.push(finalizer.into());
+        }
+        object["metadata"]["finalizers"] = list.into();
+    }
+    object
+}
+
+fn gone(entry: &Entry, stored: &Stored) -> Response {
+    let status = json!({
+        "kind": "Status",
+        "apiVersion": "v1",
+        "metadata": {},
+        "status": "Success",
+        "details": {
+            "name": &*stored.key.name,
+            "group": entry.info.group,
+            "kind": entry.info.plural,
+            "uid": &*stored.uid,
+        },
+    });
+    super::json(StatusCode::OK, &status)
+}

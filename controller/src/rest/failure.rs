@@ -1,0 +1,220 @@
+//! Every refusal as a `metav1.Status`, with the reasons and causes that clients look at.
+
+use axum::response::{IntoResponse, Response};
+use http::{Method, StatusCode};
+use muster_api::validate::Violations;
+use serde_json::{Value, json};
+
+use super::path::{Object, Target, Verb};
+use super::registry::Entry;
+use crate::store::StoreError;
+
+/// A refusal.
+#[derive(Debug, Clone)]
+pub struct Failure {
+    code: StatusCode,
+    reason: &'static str,
+    message: String,
+    details: Value,
+}
+
+impl Failure {
+    pub(crate) fn new(code: StatusCode, reason: &'static str, message: impl Into<String>) -> Self {
+        Self { code, reason, message: message.into(), details: Value::Null }
+    }
+
+    /// The HTTP status.
+    #[must_use]
+    pub fn code(&self) -> u16 {
+        self.code.as_u16()
+    }
+
+    /// What it says to people.
+    #[must_use]
+    pub fn message(&self) -> &str {
+        &self.message
+    }
+
+    pub(crate) fn bad_request(message: impl Into<String>) -> Self {
+        Self::new(StatusCode::BAD_REQUEST, "BadRequest", message)
+    }
+
+    pub(crate) fn unauthorized(message: impl Into<String>) -> Self {
+        Self::new(StatusCode::UNAUTHORIZED, "Unauthorized", message)
+    }
+
+    pub(crate) fn denied(message: impl Into<String>) -> Self {
+        Self::new(StatusCode::FORBIDDEN, "Forbidden", message)
+    }
+
+    pub(crate) fn forbidden(who: &str, verb: Verb, target: &Target) -> Self {
+        let what = target.resource().unwrap_or("this path");
+        Self::denied(format!("{what} is forbidden: {who:?} may not {} it", verb.as_str()))
+    }
+
+    pub(crate) fn unknown_path(path: &str) -> Self {
+        let message = format!("the server could not find {path:?}");
+        Self::new(StatusCode::NOT_FOUND, "NotFound", message)
+    }
+
+    pub(crate) fn method(method: &Method) -> Self {
+        let message = format!("{method} is not served here");
+        Self::new(StatusCode::METHOD_NOT_ALLOWED, "MethodNotAllowed", message)
+    }
+
+    pub(crate) fn method_not_allowed(verb: Verb, object: &Object) -> Self {
+        let (verb, kind) = (verb.as_str(), object.entry.qualified());
+        Self::new(
+            StatusCode::METHOD_NOT_ALLOWED,
+            "MethodNotAllowed",
+            format!("{verb} is not supported on {kind}"),
+        )
+    }
+
+    pub(crate) fn timeout(message: impl Into<String>) -> Self {
+        Self::new(StatusCode::GATEWAY_TIMEOUT, "Timeout", message)
+    }
+
+    pub(crate) fn internal(message: impl Into<String>) -> Self {
+        Self::new(StatusCode::INTERNAL_SERVER_ERROR, "InternalError", message)
+    }
+
+    pub(crate) fn unavailable(message: impl Into<String>) -> Self {
+        let mut failure = Self::new(StatusCode::SERVICE_UNAVAILABLE, "ServiceUnavailable", message);
+        failure.details = json!({"retryAfterSeconds": 1});
+        failure
+    }
+
+    pub(crate) fn not_found(entry: &Entry, name: &str) -> Self {
+        let message = format!("{} {name:?} not found", entry.qualified());
+        Self::new(StatusCode::NOT_FOUND, "NotFound", message).about(entry, name)
+    }
+
+    pub(crate) fn already_exists(entry: &Entry, name: &str) -> Self {
+        let message = format!("{} {name:?} already exists", entry.qualified());
+        Self::new(StatusCode::CONFLICT, "AlreadyExists", message).about(entry, name)
+    }
+
+    pub(crate) fn conflict(entry: &Entry, name: &str, why: impl std::fmt::Display) -> Self {
+        let message =
+            format!("Operation cannot be fulfilled on {} {name:?}: {why}", entry.qualified());
+        Self::new(StatusCode::CONFLICT, "Conflict", message).about(entry, name)
+    }
+
+    pub(crate) fn stale(entry: &Entry, name: &str) -> Self {
+        let why = "the object has been modified; please apply your changes to the latest version \
+                   and try again";
+        Self::conflict(entry, name, why)
+    }
+
+    /// 410: the history that was asked for is gone.
+    pub(crate) fn expired(why: impl std::fmt::Display) -> Self {
+        Self::new(StatusCode::GONE, "Expired", why.to_string())
+    }
+
+    /// What Kubernetes says to a revision that it has not reached.
+    pub(crate) fn ahead(asked: u64, current: u64) -> Self {
+        let message = format!("Too large resource version: {asked}, current: {current}");
+        let mut failure = Self::timeout(&message);
+        failure.details = json!({
+            "retryAfterSeconds": 1,
+            "causes": [{"reason": "ResourceVersionTooLarge", "message": "Too large resource version"}],
+        });
+        failure
+    }
+
+    /// 422 with every violation as a cause.
+    pub(crate) fn invalid(entry: &Entry, name: &str, violations: &Violations) -> Self {
+        let texts: Vec<String> = violations.iter().map(ToString::to_string).collect();
+        let texts = match &texts[..] {
+            [only] => only.clone(),
+            several => format!("[{}]", several.join(", ")),
+        };
+        let kind = entry.kind_and_group();
+        let message = format!("{kind} {name:?} is invalid: {texts}");
+        let causes: Vec<Value> = violations
+            .iter()
+            .map(|violation| {
+                json!({
+                    "reason": violation.kind.cause_reason(),
+                    "message": violation.message(),
+                    "field": violation.path,
+                })
+            })
+            .collect();
+        let mut failure =
+            Self::new(StatusCode::UNPROCESSABLE_ENTITY, "Invalid", message).about(entry, name);
+        failure.details["kind"] = entry.info.kind.into();
+        failure.details["causes"] = causes.into();
+        failure
+    }
+
+    /// Says which object it is about.
+    pub(crate) fn about(mut self, entry: &Entry, name: &str) -> Self {
+        self.details =
+            json!({"name": name, "group": entry.info.group, "kind": entry.resource.as_str()});
+        self
+    }
+
+    /// Adds a cause.
+    pub(crate) fn because(mut self, reason: &str, message: &str, field: &str) -> Self {
+        if self.details.is_null() {
+            self.details = json!({});
+        }
+        self.details["causes"] = json!([{"reason": reason, "message": message, "field": field}]);
+        self
+    }
+
+    /// What the store refused, as it concerns an object of `entry`.
+    pub(crate) fn of_store(entry: &Entry, name: &str, error: &StoreError) -> Self {
+        match error {
+            StoreError::AlreadyExists { .. } => Self::already_exists(entry, name),
+            StoreError::NotFound { .. } => Self::not_found(entry, name),
+            StoreError::Conflict { .. } => Self::stale(entry, name),
+            StoreError::UidMismatch { expected, actual, .. } => Self::conflict(
+                entry,
+                name,
+                format!(
+                    "Precondition failed: UID in precondition: {expected}, UID in object meta: {actual}"
+                ),
+            ),
+            StoreError::Malformed { .. } => Self::bad_request(error.to_string()),
+            StoreError::Closed => Self::unavailable(error.to_string()),
+            StoreError::Storage { .. } => Self::internal(crate::app::chain(error)),
+        }
+    }
+
+    /// The Status object.
+    #[must_use]
+    pub fn status(&self) -> Value {
+        let mut status = json!({
+            "kind": "Status",
+            "apiVersion": "v1",
+            "metadata": {},
+            "status": "Failure",
+            "message": self.message,
+            "reason": self.reason,
+            "code": self.code.as_u16(),
+        });
+        if !self.details.is_null() {
+            status["details"] = self.details.clone();
+        }
+        status
+    }
+}
+
+impl IntoResponse for Failure {
+    fn into_response(self) -> Response {
+        let mut response = super::json(self.code, &self.status());
+        if let Some(seconds) = self.details.get("retryAfterSeconds").and_then(Value::as_u64) {
+            response.headers_mut().insert(http::header::RETRY_AFTER, seconds.into());
+        }
+        if self.code == StatusCode::PAYLOAD_TOO_LARGE {
+            // The rest of the body stays unread, so an HTTP/1 connection is of no further use, and its client
+            // should not find that out with its next request.
+            let close = http::HeaderValue::from_static("close");
+            response.headers_mut().insert(http::header::CONNECTION, close);
+        }
+        response
+    }
+}

@@ -1,0 +1,179 @@
+//! Kubernetes API conventions over the store.
+//!
+//! Every request is first read as a verb on a [`path::Target`], then authorised, then answered by one file a verb:
+//!
+//! | file | answers |
+//! |---|---|
+//! | [`path`] | URL + method → target and verb |
+//! | `query`, `body` | parameters; JSON bodies with their limit |
+//! | `registry` | what is served: one entry a kind |
+//! | `discovery` | /api, /apis, resource lists, /version |
+//! | [`create`], [`list`], [`watch`], [`update`], [`patch`], [`delete`] | verbs on objects |
+//! | `metadata`, `admission` | server-owned fields; violations, unknown fields |
+//! | `selector` | label and field selectors |
+//! | [`namespace`] | the default namespace; ending of namespaces |
+//! | [`token`], `join` | join tokens; certificates for agents |
+//! | `question` | plan, why, usage: answers that are no objects |
+//! | [`log`] | logs of tasks |
+//! | [`failure`] | every refusal as a `metav1.Status` |
+
+mod admission;
+mod body;
+pub mod create;
+pub mod delete;
+mod discovery;
+pub mod failure;
+mod join;
+mod list;
+pub mod log;
+mod metadata;
+pub mod namespace;
+mod patch;
+pub mod path;
+mod query;
+mod question;
+pub(crate) mod registry;
+mod selector;
+pub mod token;
+mod update;
+mod watch;
+
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use axum::Router;
+use axum::body::Body;
+use axum::extract::State;
+use axum::response::{IntoResponse as _, Response};
+use http::{HeaderValue, Request, StatusCode, header};
+use serde_json::Value;
+
+use crate::auth::{Identity, Permission, permits};
+use crate::context::Context;
+use failure::Failure;
+use path::{Object, Subresource, Target, Verb};
+use query::Query;
+
+/// An answer that takes longer than this is a fault of ours, and the client should hear of it.
+const TIMEOUT: Duration = Duration::from_secs(60);
+
+/// Bytes, ready to be an answer.
+pub(crate) type Answer = Result<Response, Failure>;
+
+/// One request, read.
+pub(crate) struct Call {
+    pub(crate) context: Arc<Context>,
+    pub(crate) identity: Identity,
+    pub(crate) query: Query,
+    pub(crate) request: Request<Body>,
+}
+
+/// The REST half of the port. Unknown paths are answered too, with a Status.
+pub fn router(context: Arc<Context>) -> Router {
+    Router::new().fallback(handle).with_state(context)
+}
+
+async fn handle(State(context): State<Arc<Context>>, request: Request<Body>) -> Response {
+    let start = Instant::now();
+    let read = path::read(request.method(), request.uri());
+    let labels = read.as_ref().map_or(("unknown", "none"), |(verb, target)| {
+        (verb.as_str(), target.resource().unwrap_or("none"))
+    });
+    let long = matches!(
+        &read,
+        Ok((Verb::Watch, _))
+            | Ok((_, Target::Objects(Object { subresource: Some(Subresource::Log), .. })))
+    );
+    let answer = match read {
+        Err(failure) => Err(failure),
+        Ok((verb, target)) if long => dispatch(context, verb, target, request).await,
+        Ok((verb, target)) => {
+            match tokio::time::timeout(TIMEOUT, dispatch(context, verb, target, request)).await {
+                Ok(answer) => answer,
+                Err(_) => Err(Failure::timeout("the request was not answered in time")),
+            }
+        }
+    };
+    let response = answer.unwrap_or_else(Failure::into_response);
+    let code = response.status().as_u16().to_string();
+    metrics::counter!("muster_http_requests_total",
+        "verb" => labels.0, "resource" => labels.1, "code" => code)
+    .increment(1);
+    if !long {
+        metrics::histogram!("muster_http_request_seconds", "verb" => labels.0)
+            .record(start.elapsed());
+    }
+    response
+}
+
+async fn dispatch(
+    context: Arc<Context>,
+    verb: Verb,
+    target: Target,
+    request: Request<Body>,
+) -> Answer {
+    let identity = request.extensions().get::<Identity>().cloned().unwrap_or(Identity::Anonymous);
+    match permits(&identity, verb, &target) {
+        Permission::Granted => {}
+        Permission::WhoAreYou => {
+            return Err(Failure::unauthorized("a client certificate is needed"));
+        }
+        Permission::Denied => return Err(Failure::forbidden(&identity.name(), verb, &target)),
+    }
+    let query = Query::read(request.uri())?;
+    let call = Call { context, identity, query, request };
+    match target {
+        Target::Health(probe) => health(&call.context, probe),
+        Target::Metrics => Ok(call.context.metrics.render().into_response()),
+        Target::Version => Ok(json(StatusCode::OK, &discovery::version())),
+        Target::Discovery(what) => discovery::answer(what),
+        Target::Join => join::join(call).await,
+        Target::Plan => question::plan(call).await,
+        Target::Usage => question::usage(&call),
+        Target::Tokens(id) => token::answer(call, verb, id).await,
+        Target::Objects(object) => objects(call, verb, object).await,
+    }
+}
+
+async fn objects(call: Call, verb: Verb, object: Object) -> Answer {
+    if object.subresource == Some(Subresource::Log) {
+        return log::open(call, object).await;
+    }
+    if object.subresource == Some(Subresource::Why) {
+        return question::why(call, object).await;
+    }
+    if !object.allows(verb) {
+        return Err(Failure::method_not_allowed(verb, &object));
+    }
+    match verb {
+        Verb::Get => list::get(&call, &object),
+        Verb::List => list::list(&call, &object),
+        Verb::Watch => watch::watch(&call, &object),
+        Verb::Create => create::create(call, object).await,
+        Verb::Update => update::replace(call, object).await,
+        Verb::Patch => patch::patch(call, object).await,
+        Verb::Delete => delete::delete(call, object).await,
+        Verb::DeleteCollection => delete::collection(call, object).await,
+    }
+}
+
+fn health(context: &Context, probe: path::Probe) -> Answer {
+    if probe == path::Probe::Ready && (context.stop.is_cancelled() || !context.store.is_open()) {
+        return Ok((StatusCode::SERVICE_UNAVAILABLE, "not ready: shutting down\n").into_response());
+    }
+    Ok("ok".into_response())
+}
+
+/// A JSON tree as an answer.
+pub(crate) fn json(code: StatusCode, value: &Value) -> Response {
+    raw(code, Body::from(value.to_string()))
+}
+
+/// Rendered JSON as an answer.
+pub(crate) fn raw(code: StatusCode, body: impl Into<Body>) -> Response {
+    let mut response = Response::new(body.into());
+    *response.status_mut() = code;
+    let json = HeaderValue::from_static("application/json");
+    response.headers_mut().insert(header::CONTENT_TYPE, json);
+    response
+}

@@ -1,0 +1,298 @@
+//! URL and method → what is asked for.
+
+use http::{Method, Uri};
+
+use super::failure::Failure;
+use super::registry::{self, Entry};
+use crate::store::Key;
+
+/// What a request does, in Kubernetes' words.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Verb {
+    /// Read one object.
+    Get,
+    /// Read a collection.
+    List,
+    /// Follow changes.
+    Watch,
+    /// POST.
+    Create,
+    /// PUT.
+    Update,
+    /// PATCH.
+    Patch,
+    /// DELETE of one object.
+    Delete,
+    /// DELETE of a collection.
+    DeleteCollection,
+}
+
+impl Verb {
+    /// The word, as in a resource's list of verbs.
+    #[must_use]
+    pub const fn as_str(self) -> &'static str {
+        match self {
+            Self::Get => "get",
+            Self::List => "list",
+            Self::Watch => "watch",
+            Self::Create => "create",
+            Self::Update => "update",
+            Self::Patch => "patch",
+            Self::Delete => "delete",
+            Self::DeleteCollection => "deletecollection",
+        }
+    }
+}
+
+/// Which question about health.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Probe {
+    /// Is the process alive?
+    Live,
+    /// Does it answer writes?
+    Ready,
+}
+
+/// Which part of discovery.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Discovery {
+    /// `/`
+    Root,
+    /// `/api`
+    Core,
+    /// `/apis`
+    Groups,
+    /// `/apis/muster.dev`
+    Group,
+    /// `/api/v1` (empty group) or `/apis/muster.dev/v1alpha1`
+    Resources(&'static str),
+}
+
+/// A part of an object with a path of its own.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Subresource {
+    /// `…/status`
+    Status,
+    /// `…/log`
+    Log,
+    /// `…/why`
+    Why,
+}
+
+/// One object, or a collection when `name` is `None`.
+#[derive(Debug, Clone)]
+pub struct Object {
+    pub(crate) entry: &'static Entry,
+    /// `None` for cluster-scoped kinds and for lists over all namespaces.
+    pub(crate) namespace: Option<String>,
+    pub(crate) name: Option<String>,
+    pub(crate) subresource: Option<Subresource>,
+}
+
+impl Object {
+    /// The key of the named object.
+    pub(crate) fn key(&self) -> Result<Key, Failure> {
+        let name = self.name.as_deref().ok_or_else(|| Failure::bad_request("a name is needed"))?;
+        Ok(self.entry.key(self.namespace.as_deref(), name))
+    }
+
+    pub(crate) fn allows(&self, verb: Verb) -> bool {
+        match self.subresource {
+            Some(Subresource::Log | Subresource::Why) => verb == Verb::Get,
+            Some(Subresource::Status) => {
+                self.entry.info.has_status
+                    && (verb == Verb::Get
+                        || self.entry.verbs.contains(&verb)
+                            && matches!(verb, Verb::Update | Verb::Patch))
+            }
+            None => self.entry.verbs.contains(&verb),
+        }
+    }
+}
+
+/// What a request is about.
+#[derive(Debug, Clone)]
+pub(crate) enum Target {
+    Health(Probe),
+    Metrics,
+    Version,
+    Discovery(Discovery),
+    Join,
+    /// What the real scheduler would do with some objects.
+    Plan,
+    /// What nodes and tasks use now.
+    Usage,
+    /// Join tokens; one when it is named.
+    Tokens(Option<String>),
+    Objects(Object),
+}
+
+impl Target {
+    /// The plural, for metrics and messages.
+    pub(crate) fn resource(&self) -> Option<&'static str> {
+        match self {
+            Self::Objects(object) => Some(object.entry.resource.as_str()),
+            Self::Tokens(_) => Some("jointokens"),
+            Self::Join => Some("join"),
+            Self::Plan => Some("plan"),
+            Self::Usage => Some("usage"),
+            _ => None,
+        }
+    }
+}
+
+/// Reads a request's line.
+pub(crate) fn read(method: &Method, uri: &Uri) -> Result<(Verb, Target), Failure> {
+    let path = uri.path();
+    let parts: Vec<&str> = path.split('/').filter(|part| !part.is_empty()).collect();
+    let unknown = || Failure::unknown_path(path);
+    let target = match parts[..] {
+        ["healthz" | "livez"] => Target::Health(Probe::Live),
+        ["readyz"] => Target::Health(Probe::Ready),
+        ["metrics"] => Target::Metrics,
+        ["version"] => Target::Version,
+        [] => Target::Discovery(Discovery::Root),
+        ["api"] => Target::Discovery(Discovery::Core),
+        ["apis"] => Target::Discovery(Discovery::Groups),
+        ["apis", muster_api::GROUP] => Target::Discovery(Discovery::Group),
+        ["api", "v1"] => Target::Discovery(Discovery::Resources("")),
+        ["apis", muster_api::GROUP, muster_api::VERSION] => {
+            Target::Discovery(Discovery::Resources(muster_api::GROUP))
+        }
+        ["api", "v1", ref rest @ ..] => Target::Objects(object("", rest).ok_or_else(unknown)?),
+        ["apis", muster_api::GROUP, muster_api::VERSION, ref rest @ ..] => match rest {
+            ["join"] => Target::Join,
+            ["plan"] => Target::Plan,
+            ["usage"] => Target::Usage,
+            ["jointokens"] => Target::Tokens(None),
+            ["jointokens", id] => Target::Tokens(Some((*id).to_owned())),
+            _ => Target::Objects(object(muster_api::GROUP, rest).ok_or_else(unknown)?),
+        },
+        _ => return Err(unknown()),
+    };
+    let named = match &target {
+        Target::Objects(object) => object.name.is_some(),
+        Target::Tokens(id) => id.is_some(),
+        _ => true,
+    };
+    let verb = verb(method, uri, named).ok_or_else(|| Failure::method(method))?;
+    let read_only = matches!(
+        target,
+        Target::Health(_) | Target::Metrics | Target::Version | Target::Discovery(_) | Target::Usage
+    );
+    let post_only = matches!(target, Target::Join | Target::Plan);
+    if read_only && verb != Verb::Get || post_only && verb != Verb::Create {
+        return Err(Failure::method(method));
+    }
+    Ok((verb, target))
+}
+
+fn verb(method: &Method, uri: &Uri, named: bool) -> Option<Verb> {
+    let watching = uri.query().is_some_and(|query| {
+        query.split('&').any(|pair| matches!(pair, "watch=true" | "watch=1" | "watch"))
+    });
+    Some(match (method.as_str(), named) {
+        ("GET" | "HEAD", true) => Verb::Get,
+        ("GET" | "HEAD", false) if watching => Verb::Watch,
+        ("GET" | "HEAD", false) => Verb::List,
+        ("POST", _) => Verb::Create,
+        ("PUT", true) => Verb::Update,
+        ("PATCH", true) => Verb::Patch,
+        ("DELETE", true) => Verb::Delete,
+        ("DELETE", false) => Verb::DeleteCollection,
+        _ => return None,
+    })
+}
+
+/// `[namespaces/NS/]PLURAL[/NAME[/SUB]]`. Namespaces themselves are `namespaces[/NAME[/SUB]]`.
+fn object(group: &str, parts: &[&str]) -> Option<Object> {
+    let (namespace, rest) = match parts {
+        ["namespaces", namespace, plural, rest @ ..]
+            if registry::find(group, plural).is_some_and(|entry| entry.info.namespaced) =>
+        {
+            (Some((*namespace).to_owned()), [&[*plural], rest].concat())
+        }
+        _ => (None, parts.to_vec()),
+    };
+    let (plural, name, sub) = match rest[..] {
+        [plural] => (plural, None, None),
+        [plural, name] => (plural, Some(name.to_owned()), None),
+        [plural, name, sub] => (plural, Some(name.to_owned()), Some(sub)),
+        _ => return None,
+    };
+    let entry = registry::find(group, plural)?;
+    let subresource = match sub {
+        None => None,
+        Some("status") if entry.info.has_status => Some(Subresource::Status),
+        Some("log") if entry.has_log => Some(Subresource::Log),
+        Some("why") if entry.has_log => Some(Subresource::Why),
+        Some(_) => return None,
+    };
+    // An object of a namespaced kind has no path outside its namespace.
+    if entry.info.namespaced && namespace.is_none() && name.is_some() {
+        return None;
+    }
+    Some(Object { entry, namespace, name, subresource })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn read_text(method: &str, uri: &str) -> String {
+        let method: Method = method.parse().unwrap();
+        match read(&method, &uri.parse().unwrap()) {
+            Ok((verb, Target::Objects(object))) => format!(
+                "{} {} ns={:?} name={:?} sub={:?}",
+                verb.as_str(),
+                object.entry.resource,
+                object.namespace,
+                object.name,
+                object.subresource
+            ),
+            Ok((verb, target)) => format!("{} {target:?}", verb.as_str()),
+            Err(failure) => failure.code().to_string(),
+        }
+    }
+
+    #[test]
+    fn paths_are_read_as_kubernetes_does() {
+        let g = "/apis/muster.dev/v1alpha1";
+        let cases = [
+            ("GET", format!("{g}/tasks"), "list tasks ns=None name=None sub=None"),
+            ("GET", format!("{g}/tasks?watch=true"), "watch tasks ns=None name=None sub=None"),
+            (
+                "POST",
+                format!("{g}/namespaces/a/tasks"),
+                "create tasks ns=Some(\"a\") name=None sub=None",
+            ),
+            (
+                "PUT",
+                format!("{g}/namespaces/a/tasks/t/status"),
+                "update tasks ns=Some(\"a\") name=Some(\"t\") sub=Some(Status)",
+            ),
+            ("GET", format!("{g}/tasks/t"), "404"),
+            ("GET", format!("{g}/nodes/n/log"), "404"),
+            ("DELETE", format!("{g}/nodes"), "deletecollection nodes ns=None name=None sub=None"),
+            ("GET", "/api/v1/namespaces".into(), "list namespaces ns=None name=None sub=None"),
+            (
+                "GET",
+                "/api/v1/namespaces/a/status".into(),
+                "get namespaces ns=None name=Some(\"a\") sub=Some(Status)",
+            ),
+            (
+                "GET",
+                "/api/v1/namespaces/a/events".into(),
+                "list events ns=Some(\"a\") name=None sub=None",
+            ),
+            ("GET", "/api/v1/pods".into(), "404"),
+            ("GET", "/apis/other/v1/things".into(), "404"),
+            ("PUT", format!("{g}/nodes"), "405"),
+            ("POST", "/healthz".into(), "405"),
+            ("GET", format!("{g}/join"), "405"),
+        ];
+        for (method, uri, expected) in cases {
+            assert_eq!(read_text(method, &uri), expected, "{method} {uri}");
+        }
+    }
+}

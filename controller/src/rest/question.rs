@@ -1,0 +1,165 @@
+//! Answers that are no objects: what would be decided, why a task waits, what is used now.
+
+use std::sync::Arc;
+
+use http::StatusCode;
+use muster_api::id::TaskUid;
+use muster_api::kind::namespace::DEFAULT;
+use muster_api::kind::task::Task;
+use muster_api::phase::TaskPhase;
+use muster_api::validate::{Violations, element_path};
+use muster_controller_core::schedule::{Demand, Plan};
+use serde_json::{Value, json};
+
+use super::failure::Failure;
+use super::path::Object;
+use super::{Answer, Call, body, registry};
+use crate::context::{Context, Live};
+use crate::objects;
+
+fn live(context: &Context) -> Result<&Live, Failure> {
+    context.live().ok_or_else(|| Failure::unavailable("the scheduler is not running"))
+}
+
+fn ended<E: std::fmt::Display>(error: E) -> Failure {
+    Failure::unavailable(error.to_string())
+}
+
+/// GET …/usage: the last sample of every connected node, read from its kernel.
+pub(super) fn usage(call: &Call) -> Answer {
+    let live = live(&call.context)?;
+    let (mut nodes, mut tasks) = (Vec::new(), Vec::new());
+    for (name, usage) in live.sessions.usage() {
+        nodes.push(json!({
+            "name": name.as_str(),
+            "cpuMillis": usage.node.cpu_millis,
+            "memoryBytes": usage.node.memory_bytes,
+        }));
+        for task in &usage.tasks {
+            let Some((_, key)) = live.sessions.board().find(&task.uid) else { continue };
+            let amount = task.usage.unwrap_or_default();
+            tasks.push(json!({
+                "namespace": key.namespace(),
+                "name": &*key.name,
+                "uid": task.uid,
+                "node": name.as_str(),
+                "cpuMillis": amount.cpu_millis,
+                "memoryBytes": amount.memory_bytes,
+                "cpuTotalUsec": amount.cpu_total_usec,
+            }));
+        }
+    }
+    Ok(super::json(StatusCode::OK, &json!({ "nodes": nodes, "tasks": tasks })))
+}
+
+/// GET …/tasks/NAME/why: every node's reason, not only those that fit into the status.
+pub(super) async fn why(call: Call, target: Object) -> Answer {
+    let key = target.key()?;
+    let stored = call.context.store.get(&key).ok_or_else(|| Failure::not_found(target.entry, &key.name))?;
+    let task: Task = objects::read(&stored).ok_or_else(|| Failure::internal("the task does not read as one"))?;
+    let status = task.status.unwrap_or_default();
+    let why = if status.phase == TaskPhase::Pending {
+        let scheduler = live(&call.context)?.scheduler.clone();
+        scheduler.why(TaskUid::new(&*stored.uid), Arc::new(task.spec)).await.map_err(ended)?
+    } else {
+        Vec::new()
+    };
+    let why = if why.is_empty() { status.why.clone() } else { why };
+    let decision = status.node.as_ref().map(|node| {
+        json!({ "node": node, "score": status.score, "lease": status.lease, "boundAt": status.bound_at })
+    });
+    let answer = json!({ "phase": status.phase, "why": why, "decision": decision });
+    Ok(super::json(StatusCode::OK, &answer))
+}
+
+/// POST …/plan: what applying some objects would do. The real scheduler decides, on a copy of what it
+/// knows; nothing is changed.
+pub(super) async fn plan(call: Call) -> Answer {
+    let Call { context, request, .. } = call;
+    let (parts, body) = request.into_parts();
+    let body = body::json(&parts.headers, body).await?;
+    let objects = body.get("objects").and_then(Value::as_array);
+    let objects = objects.ok_or_else(|| Failure::bad_request("the body must be {\"objects\": […]}"))?;
+    let revision = context.store.revision();
+    let (mut changes, mut demands) = (Vec::new(), Vec::new());
+    for (i, object) in objects.iter().enumerate() {
+        let object = muster_api::kind::admit(object).map_err(|v| refused(i, v))?;
+        let change = change_of(&context, &object)?;
+        if object["kind"] == "Task" && change["action"] == "create" {
+            demands.push(demand(i, &object, revision)?);
+        }
+        changes.push(change);
+    }
+    let names: Vec<(TaskUid, Value)> = demands
+        .iter()
+        .map(|d| {
+            let (namespace, name) = d.title.split_once('/').unwrap_or_default();
+            (d.uid.clone(), json!({ "namespace": namespace, "name": name }))
+        })
+        .collect();
+    let plan = live(&context)?.scheduler.plan(demands).await.map_err(ended)?;
+    let answer = describe(&names, &plan, changes, revision);
+    Ok(super::json(StatusCode::OK, &answer))
+}
+
+fn refused(index: usize, violations: Violations) -> Failure {
+    let texts: Vec<String> =
+        violations.iter().map(|v| format!("{}: {v}", element_path("objects", index))).collect();
+    Failure::bad_request(texts.join("; "))
+}
+
+fn change_of(context: &Context, object: &Value) -> Result<Value, Failure> {
+    let text = |pointer: &str| object.pointer(pointer).and_then(Value::as_str);
+    let kind = text("/kind").unwrap_or_default();
+    let name = text("/metadata/name").ok_or_else(|| Failure::bad_request("a planned object needs metadata.name"))?;
+    let info = muster_api::kind::find(text("/apiVersion").unwrap_or_default(), kind)
+        .expect("admission found the kind before");
+    let entry = registry::find(info.group, info.plural)
+        .ok_or_else(|| Failure::bad_request(format!("{kind} objects cannot be planned")))?;
+    let namespace = info.namespaced.then(|| text("/metadata/namespace").unwrap_or(DEFAULT));
+    let present = context.store.get(&entry.key(namespace, name)).map(|s| s.value());
+    let same = |present: &Value| {
+        let labels = |o: &Value| o.pointer("/metadata/labels").cloned().unwrap_or(json!({}));
+        present["spec"] == object["spec"] && labels(present) == labels(object)
+    };
+    let action = match &present {
+        None => "create",
+        Some(present) if same(present) => "unchanged",
+        Some(_) => "update",
+    };
+    Ok(json!({ "action": action, "kind": kind, "namespace": namespace, "name": name }))
+}
+
+fn demand(index: usize, object: &Value, revision: u64) -> Result<Demand, Failure> {
+    let task: Task = serde_json::from_value(object.clone())
+        .map_err(|e| Failure::bad_request(format!("{}: {e}", element_path("objects", index))))?;
+    let namespace = task.metadata.namespace.as_deref().unwrap_or(DEFAULT);
+    let name = task.metadata.name.as_deref().unwrap_or_default();
+    Ok(Demand {
+        uid: TaskUid::new(format!("plan-{index}")),
+        title: format!("{namespace}/{name}").into(),
+        spec: Arc::new(task.spec),
+        since: revision + 1 + index as u64,
+    })
+}
+
+fn describe(names: &[(TaskUid, Value)], plan: &Plan, changes: Vec<Value>, revision: u64) -> Value {
+    let with_name = |uid: &TaskUid, fields: Value| {
+        let mut named = names.iter().find(|(u, _)| u == uid).map_or_else(|| json!({}), |(_, n)| n.clone());
+        if let (Some(named), Value::Object(fields)) = (named.as_object_mut(), fields) {
+            named.extend(fields);
+        }
+        named
+    };
+    let placements: Vec<Value> = plan
+        .binds
+        .iter()
+        .map(|bind| {
+            let leases: Vec<Value> =
+                bind.leases.iter().map(|(group, epoch)| json!({ "group": group, "epoch": epoch })).collect();
+            with_name(&bind.uid, json!({ "node": bind.node.as_str(), "score": bind.score, "leases": leases }))
+        })
+        .collect();
+    let waits: Vec<Value> = plan.waits.iter().map(|wait| with_name(&wait.uid, json!({ "why": wait.why }))).collect();
+    json!({ "changes": changes, "placements": placements, "waits": waits, "revision": revision.to_string() })
+}

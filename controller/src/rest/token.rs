@@ -1,0 +1,246 @@
+//! Join tokens: what an agent shows once to get its certificate.
+//!
+//! A token is `muster1.ID.SECRET.CAHASH`. The store keeps the SHA-256 of the secret only; the CA's hash lets the agent
+//! know the controller before it trusts anything that it says. Tokens are records of the store that the generic REST
+//! does not serve.
+
+use http::StatusCode;
+use jiff::{SignedDuration, Timestamp};
+use ring::rand::SecureRandom as _;
+use serde::{Deserialize, Serialize};
+use serde_json::{Value, json};
+
+use super::failure::Failure;
+use super::path::Verb;
+use super::{Answer, Call, body};
+use crate::context::Context;
+use crate::pki::hex;
+use crate::store::{Key, Precondition, Resource, Stored, UpdateError};
+
+const TOKENS: Resource = Resource::new("jointokens");
+const PREFIX: &str = "muster1";
+/// Long enough to walk to the robot.
+const DEFAULT_TTL: i64 = 24 * 3600;
+/// A token is a secret in a shell history; a year is already long.
+const MAX_TTL: i64 = 365 * 24 * 3600;
+
+/// What a token allows.
+#[derive(Debug, Clone, Default, Serialize, Deserialize)]
+#[serde(rename_all = "camelCase", deny_unknown_fields)]
+pub struct TokenSpec {
+    /// How long it holds, s. Default: a day.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub ttl_seconds: Option<i64>,
+    /// The only node that may use it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub node_name: Option<String>,
+    /// How many times it may be used. Default: as often as one likes.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub uses: Option<u32>,
+}
+
+#[derive(Debug, Serialize, Deserialize)]
+#[serde(rename_all = "camelCase")]
+struct Record {
+    metadata: Metadata,
+    spec: TokenSpec,
+    secret_sha256: String,
+    expires: Timestamp,
+    used: u32,
+}
+
+#[derive(Debug, Serialize, Deserialize)]
+#[serde(rename_all = "camelCase")]
+struct Metadata {
+    name: String,
+    uid: String,
+    creation_timestamp: String,
+}
+
+#[derive(Debug, Default, Deserialize)]
+#[serde(default)]
+struct NewToken {
+    spec: TokenSpec,
+}
+
+/// A token that was just made. Its text is not kept.
+#[derive(Debug, Clone)]
+pub struct NewlyMade {
+    /// What the agent is given.
+    pub token: String,
+    /// Its public name.
+    pub id: String,
+    /// When it ends.
+    pub expires: Timestamp,
+}
+
+pub(super) async fn answer(call: Call, verb: Verb, id: Option<String>) -> Answer {
+    match (verb, id) {
+        (Verb::Create, None) => create(call).await,
+        (Verb::List, None) => {
+            let items = call.context.store.list(TOKENS, None).items;
+            let items: Vec<Value> = items.iter().filter_map(|stored| public(stored)).collect();
+            Ok(super::json(
+                StatusCode::OK,
+                &json!({
+                    "kind": "JoinTokenList", "apiVersion": muster_api::API_VERSION,
+                    "metadata": {"resourceVersion": call.context.store.revision().to_string()},
+                    "items": items,
+                }),
+            ))
+        }
+        (Verb::Get, Some(id)) => {
+            let stored = call.context.store.get(&Key::cluster(TOKENS, id.as_str()));
+            let shown = stored.and_then(|stored| public(&stored)).ok_or_else(|| unknown(&id))?;
+            Ok(super::json(StatusCode::OK, &shown))
+        }
+        (Verb::Delete, Some(id)) => {
+            let key = Key::cluster(TOKENS, id.as_str());
+            call.context.store.delete(key, Precondition::Any).await.map_err(|_| unknown(&id))?;
+            Ok(super::json(
+                StatusCode::OK,
+                &json!({
+                    "kind": "Status", "apiVersion": "v1", "metadata": {}, "status": "Success",
+                    "details": {"name": id, "group": muster_api::GROUP, "kind": "jointokens"},
+                }),
+            ))
+        }
+        _ => Err(Failure::method(call.request.method())),
+    }
+}
+
+async fn create(call: Call) -> Answer {
+    let Call { context, request, .. } = call;
+    let (parts, body) = request.into_parts();
+    let new: NewToken = match body::optional_json(&parts.headers, body).await? {
+        Value::Null => NewToken::default(),
+        body => serde_json::from_value(body)
+            .map_err(|error| Failure::bad_request(format!("JoinToken: {error}")))?,
+    };
+    let made = make(&context, new.spec).await?;
+    let stored = context.store.get(&Key::cluster(TOKENS, made.id.as_str()));
+    let mut shown = stored.and_then(|stored| public(&stored)).unwrap_or_default();
+    shown["status"]["token"] = made.token.into();
+    Ok(super::json(StatusCode::CREATED, &shown))
+}
+
+/// Makes a token. For the `demo` and for tests it is also a way past REST.
+///
+/// # Errors
+/// When the spec makes no sense or the store fails.
+pub async fn make(context: &Context, spec: TokenSpec) -> Result<NewlyMade, Failure> {
+    let ttl = spec.ttl_seconds.unwrap_or(DEFAULT_TTL);
+    if !(1..=MAX_TTL).contains(&ttl) {
+        return Err(Failure::bad_request(format!(
+            "spec.ttlSeconds: {ttl} is not in 1..={MAX_TTL}"
+        )));
+    }
+    if spec.uses == Some(0) {
+        return Err(Failure::bad_request("spec.uses: 0 would be a token for nothing"));
+    }
+    let expires = context.clock.now() + SignedDuration::from_secs(ttl);
+    let (id, secret) = (hex(&random::<5>()?), hex(&random::<32>()?));
+    let record = Record {
+        metadata: Metadata {
+            name: id.clone(),
+            uid: uuid::Uuid::new_v4().to_string(),
+            creation_timestamp: context.stamp(),
+        },
+        spec,
+        secret_sha256: hash(&secret),
+        expires,
+        used: 0,
+    };
+    let value = serde_json::to_value(&record).expect("texts and numbers serialize");
+    let key = Key::cluster(TOKENS, id.as_str());
+    context
+        .store
+        .create(key, value)
+        .await
+        .map_err(|error| Failure::internal(crate::app::chain(&error)))?;
+    let token = format!("{PREFIX}.{id}.{secret}.{}", context.pki.ca_hash());
+    Ok(NewlyMade { token, id, expires })
+}
+
+/// Uses a token for `node`, or says why it does not hold.
+pub(super) async fn spend(context: &Context, token: &str, node: &str) -> Result<(), Failure> {
+    let parts: Vec<&str> = token.trim().split('.').collect();
+    let &[PREFIX, id, secret, ca] = &parts[..] else {
+        return Err(refused("it is not a join token"));
+    };
+    if ca != context.pki.ca_hash() {
+        return Err(refused("it was made by another controller"));
+    }
+    let now = context.clock.now();
+    let key = Key::cluster(TOKENS, id);
+    let spent = context.store.update(&key, |_, value| {
+        let mut record: Record =
+            serde_json::from_value(value).map_err(|_| refused("its record is damaged"))?;
+        if !same(&record.secret_sha256, &hash(secret)) {
+            // The same words as for an id that does not exist: ids are not to be probed.
+            return Err(refused("it is not known here"));
+        }
+        if record.expires <= now {
+            return Err(refused(&format!("it expired at {}", record.expires)));
+        }
+        if record.spec.node_name.as_deref().is_some_and(|only| only != node) {
+            return Err(refused("it is for another node"));
+        }
+        if record.spec.uses.is_some_and(|uses| record.used >= uses) {
+            return Err(refused("it is used up"));
+        }
+        record.used += 1;
+        Ok(Some(serde_json::to_value(&record).expect("texts and numbers serialize")))
+    });
+    match spent.await {
+        Ok(_) => Ok(()),
+        Err(UpdateError::Refused(failure)) => Err(failure),
+        Err(UpdateError::Store(crate::store::StoreError::NotFound { .. })) => {
+            Err(refused("it is not known here"))
+        }
+        Err(UpdateError::Store(error)) => Err(Failure::internal(crate::app::chain(&error))),
+    }
+}
+
+fn refused(why: &str) -> Failure {
+    Failure::unauthorized(format!("the join token was refused: {why}"))
+}
+
+fn unknown(id: &str) -> Failure {
+    let message = format!("jointokens.{} {id:?} not found", muster_api::GROUP);
+    Failure::new(StatusCode::NOT_FOUND, "NotFound", message)
+}
+
+/// A token as it is shown: without anything that would let somebody in.
+fn public(stored: &Stored) -> Option<Value> {
+    let record: Record = stored.parse().ok()?;
+    Some(json!({
+        "kind": "JoinToken",
+        "apiVersion": muster_api::API_VERSION,
+        "metadata": {
+            "name": record.metadata.name,
+            "uid": record.metadata.uid,
+            "creationTimestamp": record.metadata.creation_timestamp,
+            "resourceVersion": stored.revision.to_string(),
+        },
+        "spec": record.spec,
+        "status": {"expires": record.expires, "used": record.used},
+    }))
+}
+
+fn hash(secret: &str) -> String {
+    hex(ring::digest::digest(&ring::digest::SHA256, secret.as_bytes()).as_ref())
+}
+
+/// Compares two hashes. Both sides are hashes, so what timing could tell is of no use; still, all of it is looked at.
+fn same(a: &str, b: &str) -> bool {
+    a.len() == b.len() && a.bytes().zip(b.bytes()).fold(0, |diff, (a, b)| diff | (a ^ b)) == 0
+}
+
+fn random<const N: usize>() -> Result<[u8; N], Failure> {
+    let mut bytes = [0; N];
+    ring::rand::SystemRandom::new()
+        .fill(&mut bytes)
+        .map_err(|_| Failure::internal("the system has no randomness to give"))?;
+    Ok(bytes)
+}

@@ -1,0 +1,205 @@
+//! PUT, and the read-modify-write that PUT and PATCH share.
+
+use std::sync::Arc;
+
+use http::{HeaderValue, StatusCode};
+use muster_api::kind;
+use muster_api::validate::Violations;
+use serde_json::Value;
+
+use super::create::with_warnings;
+use super::path::{Object, Subresource};
+use super::query::FieldValidation;
+use super::{Answer, Call, admission, body, failure::Failure, metadata};
+use crate::context::Context;
+use crate::store::{Op, Precondition, Store, StoreError, Stored};
+
+/// How a change is made.
+pub(super) struct Options {
+    pub(super) mode: FieldValidation,
+    pub(super) dry: bool,
+}
+
+impl Options {
+    pub(super) fn read(call: &Call) -> Result<Self, Failure> {
+        Ok(Self { mode: call.query.field_validation()?, dry: call.query.dry_run()? })
+    }
+}
+
+pub(super) async fn replace(call: Call, target: Object) -> Answer {
+    let options = Options::read(&call)?;
+    let Call { context, request, .. } = call;
+    let (parts, body) = request.into_parts();
+    let mut object = body::json(&parts.headers, body).await?;
+    admission::identify(target.entry, &mut object)?;
+    change(&context, &target, &options, |_| Ok(object.clone())).await
+}
+
+/// Changes one object by `make`, which is given the present one, and again when somebody else was faster. When the
+/// object that `make` returns names a resourceVersion, it is that version or 409.
+pub(super) async fn change(
+    context: &Context,
+    target: &Object,
+    options: &Options,
+    make: impl Fn(&Value) -> Result<Value, Failure>,
+) -> Answer {
+    let key = target.key()?;
+    let entry = target.entry;
+    loop {
+        let present =
+            context.store.get(&key).ok_or_else(|| Failure::not_found(entry, &key.name))?;
+        let next = next(target, &present, options.mode, &make)?;
+        let done = |bytes: bytes::Bytes| {
+            Ok(with_warnings(super::raw(StatusCode::OK, bytes), next.warnings.clone()))
+        };
+        if options.dry {
+            return done(next.object.to_string().into());
+        }
+        match write(&context.store, &present, &next.object).await {
+            Ok(stored) => return done(stored.bytes.clone()),
+            Err(StoreError::Conflict { .. }) if !next.pinned => {}
+            Err(error) => return Err(Failure::of_store(entry, &key.name, &error)),
+        }
+    }
+}
+
+/// Writes what an object becomes: nothing when nothing changed, a removal when it was only waiting to be let go.
+async fn write(
+    store: &Store,
+    present: &Arc<Stored>,
+    object: &Value,
+) -> Result<Arc<Stored>, StoreError> {
+    let old = present.value();
+    if *object == old {
+        return Ok(Arc::clone(present));
+    }
+    let let_go = metadata::is_ending(object)
+        && metadata::has_finalizers(&old)
+        && !metadata::has_finalizers(object)
+        && !super::delete::is_held(present.key.resource, object);
+    let key = present.key.clone();
+    let precondition = Precondition::revision(present.revision);
+    let op = if let_go {
+        Op::Delete { key, precondition }
+    } else {
+        Op::Put { key, value: object.clone(), precondition }
+    };
+    store.apply_one(op).await
+}
+
+struct Next {
+    object: Value,
+    warnings: Vec<HeaderValue>,
+    /// The client named a version.
+    pinned: bool,
+}
+
+fn next(
+    target: &Object,
+    present: &Stored,
+    mode: FieldValidation,
+    make: impl Fn(&Value) -> Result<Value, Failure>,
+) -> Result<Next, Failure> {
+    let entry = target.entry;
+    let name = &*present.key.name;
+    let old = present.value();
+    let mut new = make(&old)?;
+    admission::identify(entry, &mut new)?;
+    let pinned = check_identity(target, present, &new)?;
+    if target.subresource == Some(Subresource::Status) {
+        let status = new.get("status").cloned();
+        let mut object = old;
+        match (status, object.as_object_mut()) {
+            (Some(status), Some(fields)) => drop(fields.insert("status".into(), status)),
+            (None, Some(fields)) => drop(fields.remove("status")),
+            (_, None) => {}
+        }
+        if object.get("status").is_some_and(|status| !status.is_object() && !status.is_null()) {
+            let mut violations = Violations::new();
+            violations.invalid("status", "is not an object");
+            return Err(Failure::invalid(entry, name, &violations));
+        }
+        return Ok(Next { object, warnings: Vec::new(), pinned });
+    }
+    let Some(own) = metadata::of(&mut new) else {
+        return Err(Failure::bad_request("metadata is not a JSON object"));
+    };
+    metadata::carry(&old, own);
+    if entry.info.has_status
+        && let Some(fields) = new.as_object_mut()
+    {
+        match old.get("status") {
+            Some(status) => fields.insert("status".into(), status.clone()),
+            None => fields.remove("status"),
+        };
+    }
+    let mut admitted = admission::admit(entry, name, new, mode)?;
+    kind::admit_change(entry.info, &old, &admitted.object)
+        .map_err(|violations| Failure::invalid(entry, name, &violations))?;
+    check_finalizers(entry, name, &old, &admitted.object)?;
+    metadata::count(&old, &mut admitted.object);
+    Ok(Next { object: admitted.object, warnings: admitted.warnings, pinned })
+}
+
+/// Holds what the client says about the object's identity against the object. Returns whether it named a version.
+fn check_identity(target: &Object, present: &Stored, new: &Value) -> Result<bool, Failure> {
+    let (entry, key) = (target.entry, &present.key);
+    let name = &*key.name;
+    match metadata::text(new, "name") {
+        Some(said) if said != name => {
+            return Err(Failure::bad_request(format!(
+                "the name of the object ({said}) does not match the name on the URL ({name})"
+            )));
+        }
+        _ => {}
+    }
+    match (metadata::text(new, "namespace"), key.namespace()) {
+        (Some(said), Some(is)) if said != is => {
+            return Err(Failure::bad_request(format!(
+                "the namespace of the object ({said}) does not match the namespace on the URL ({is})"
+            )));
+        }
+        _ => {}
+    }
+    if let Some(uid) = metadata::text(new, "uid")
+        && *uid != *present.uid
+    {
+        let why = format!(
+            "Precondition failed: UID in precondition: {uid}, UID in object meta: {}",
+            present.uid
+        );
+        return Err(Failure::conflict(entry, name, why));
+    }
+    match metadata::text(new, "resourceVersion") {
+        None => Ok(false),
+        Some(said) if said == present.revision.to_string() => Ok(true),
+        Some(said) if said.parse::<u64>().is_ok() => Err(Failure::stale(entry, name)),
+        Some(said) => {
+            Err(Failure::bad_request(format!("resourceVersion {said:?} is not a number")))
+        }
+    }
+}
+
+/// Nobody may ask to be waited for by an object that is already ending.
+fn check_finalizers(
+    entry: &super::registry::Entry,
+    name: &str,
+    old: &Value,
+    new: &Value,
+) -> Result<(), Failure> {
+    if !metadata::is_ending(old) {
+        return Ok(());
+    }
+    let list =
+        |object: &Value| object["metadata"]["finalizers"].as_array().cloned().unwrap_or_default();
+    let before = list(old);
+    if list(new).iter().all(|finalizer| before.contains(finalizer)) {
+        return Ok(());
+    }
+    let mut violations = Violations::new();
+    violations.forbidden(
+        "metadata.finalizers",
+        "no new finalizers can be added if the object is being deleted",
+    );
+    Err(Failure::invalid(entry, name, &violations))
+}

@@ -1,0 +1,173 @@
+//! The sessions of agents: who is connected, what each should run, when each was heard.
+//!
+//! ```text
+//!   agent ──gRPC stream──▶ agents (one task a session) ──reports──▶ status of Tasks and Nodes
+//!                              ▲                │ heartbeats
+//!   store ──▶ board (what each node should have)│
+//!                              health ◀─────────┘ who is silent: reconcile::health
+//! ```
+//!
+//! | module | is |
+//! |---|---|
+//! | [`agents`] | the gRPC service |
+//! | [`board`] | assignments by node, kept up to date from the store |
+//! | [`nodes`] | what an agent says of its node → the Node object |
+//! | [`reports`] | what an agent says of a task → the Task object and its lease |
+//! | [`logs`] | logs, asked of the agent that has them |
+
+pub mod agents;
+pub mod board;
+pub mod logs;
+pub mod nodes;
+pub mod reports;
+
+use std::collections::HashMap;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+
+use muster_api::name::NodeName;
+use muster_api::wire::agent::v1 as wire;
+use muster_controller_core::node_health::{DETECT_AFTER, Monotonic, NodeHealth};
+use tokio::sync::{Notify, mpsc};
+use tokio::time::Instant;
+
+use board::Board;
+
+/// The generated server side of the session.
+#[allow(clippy::all, clippy::allow_attributes, unreachable_pub, reason = "generated")]
+pub(crate) mod proto {
+    include!(concat!(env!("OUT_DIR"), "/muster.agent.v1.rs"));
+}
+
+/// What tasks and nodes use now, as the last heartbeats said.
+pub type UsageTable = HashMap<NodeName, NodeUsage>;
+
+/// What one node said with its last heartbeat.
+#[derive(Debug, Clone, Default)]
+pub struct NodeUsage {
+    /// The whole machine.
+    pub node: wire::Usage,
+    /// By task uid.
+    pub tasks: Vec<wire::TaskUsage>,
+}
+
+/// A connected agent.
+#[derive(Debug, Clone)]
+pub(crate) struct Connection {
+    /// Tells this session from a later one of the same node.
+    pub(crate) id: u64,
+    /// Messages to the agent, beside its assignments.
+    pub(crate) outbound: mpsc::Sender<wire::ControllerMessage>,
+    /// Logs being read.
+    pub(crate) logs: Arc<logs::Readers>,
+    /// Ends this session: a later one of the same node has begun.
+    pub(crate) replaced: tokio_util::sync::CancellationToken,
+}
+
+/// Every session.
+#[derive(Debug)]
+pub struct Sessions {
+    board: Board,
+    connections: Mutex<HashMap<NodeName, Connection>>,
+    health: Mutex<NodeHealth>,
+    health_changed: Notify,
+    usage: Mutex<UsageTable>,
+    started: Instant,
+}
+
+impl Default for Sessions {
+    fn default() -> Self {
+        Sessions {
+            board: Board::default(),
+            connections: Mutex::default(),
+            health: Mutex::new(NodeHealth::new(DETECT_AFTER)),
+            health_changed: Notify::new(),
+            usage: Mutex::default(),
+            started: Instant::now(),
+        }
+    }
+}
+
+/// The lock of a table that nothing panics in half way through a change.
+fn lock<T>(table: &Mutex<T>) -> MutexGuard<'_, T> {
+    table.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+impl Sessions {
+    /// What each node should run.
+    #[must_use]
+    pub fn board(&self) -> &Board {
+        &self.board
+    }
+
+    fn now(&self) -> Monotonic {
+        self.started.elapsed()
+    }
+
+    /// A heartbeat came. True: the node had been silent, or was never heard.
+    pub fn heard(&self, node: &NodeName) -> bool {
+        let back = lock(&self.health).heard(node, self.now());
+        if back {
+            self.health_changed.notify_one();
+        }
+        back
+    }
+
+    /// Counts a node as heard `extra` after now, unless it was heard already.
+    pub fn presume_heard(&self, node: &NodeName, extra: Duration) {
+        lock(&self.health).presume(node, self.now() + extra);
+        self.health_changed.notify_one();
+    }
+
+    /// The node counts as there.
+    #[must_use]
+    pub fn is_heard(&self, node: &NodeName) -> bool {
+        lock(&self.health).is_alive(node)
+    }
+
+    /// Nodes that fell silent since the last call, and for how long.
+    pub fn silent_nodes(&self) -> Vec<(NodeName, Duration)> {
+        lock(&self.health).lost(self.now())
+    }
+
+    /// When a node can next count as silent.
+    #[must_use]
+    pub fn next_silence(&self) -> Option<Instant> {
+        lock(&self.health).next_deadline().map(|d| self.started + d)
+    }
+
+    /// Ready when a node was heard that was not before.
+    pub async fn health_changed(&self) {
+        self.health_changed.notified().await;
+    }
+
+    /// The last usage of every node.
+    #[must_use]
+    pub fn usage(&self) -> UsageTable {
+        lock(&self.usage).clone()
+    }
+
+    pub(crate) fn set_usage(&self, node: &NodeName, usage: NodeUsage) {
+        lock(&self.usage).insert(node.clone(), usage);
+    }
+
+    pub(crate) fn connection(&self, node: &NodeName) -> Option<Connection> {
+        lock(&self.connections).get(node).cloned()
+    }
+
+    /// Takes a session in; an earlier one of the same node ends.
+    pub(crate) fn connect(&self, node: &NodeName, connection: Connection) {
+        if let Some(earlier) = lock(&self.connections).insert(node.clone(), connection) {
+            earlier.replaced.cancel();
+        }
+    }
+
+    /// A session has ended. A later one of the same node stays.
+    pub(crate) fn disconnect(&self, node: &NodeName, id: u64) {
+        let mut connections = lock(&self.connections);
+        if connections.get(node).is_some_and(|c| c.id == id) {
+            connections.remove(node);
+            lock(&self.usage).remove(node);
+        }
+    }
+}

@@ -1,0 +1,178 @@
+//! What an agent says of its node → the Node object.
+//!
+//! The agent owns labels, capacity, functions, pose, runtimes and its own conditions; the operator
+//! owns `spec` (but for what the agent said when it joined first); the controller owns Ready and the
+//! books.
+
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::{MicroTime, Time};
+use muster_api::condition::{self, Condition, ConditionStatus, set_condition};
+use muster_api::id::Incarnation;
+use muster_api::kind::lease::{DEFAULT_GROUP, Lease, LeaseSpec, LeaseStatus};
+use muster_api::kind::node::{Node, NodeKind, NodeSpec, NodeStatus};
+use muster_api::name::NodeName;
+use muster_api::pose::Pose;
+use muster_api::wire::agent_session::NodeReport;
+
+use crate::context::Context;
+use crate::objects;
+use crate::store::{Op, StoreError};
+
+/// How far a robot moves until its pose is written down again, metres. In between, the live pose is
+/// what placement uses.
+const POSE_STEP: f64 = 1.0;
+
+/// What a session says of its agent.
+#[derive(Debug, Clone)]
+pub(crate) struct Speaker {
+    pub(crate) node: NodeName,
+    pub(crate) incarnation: Incarnation,
+    pub(crate) version: String,
+}
+
+/// Why an agent's word about its node is not taken.
+#[derive(Debug, thiserror::Error)]
+pub(crate) enum NodeError {
+    #[error(
+        "node {node} joined as a {was:?} and now says that it is a {says:?}; delete the node, or correct the agent's --kind"
+    )]
+    KindChanged { node: NodeName, was: NodeKind, says: NodeKind },
+    #[error(transparent)]
+    Store(#[from] StoreError),
+}
+
+/// Writes what an agent says of its node; creates the Node when it is new. Ready becomes true.
+pub(crate) async fn write(context: &Context, speaker: &Speaker, report: &NodeReport) -> Result<(), NodeError> {
+    let key = objects::node_key(speaker.node.as_str());
+    loop {
+        let Some(stored) = context.store.get(&key) else {
+            match context.store.apply(create(context, speaker, report)).await {
+                Ok(_) => return Ok(()),
+                Err(error) if objects::is_race(&error) => continue,
+                Err(error) => return Err(error.into()),
+            }
+        };
+        let Some(mut node) = objects::read::<Node>(&stored) else { return Ok(()) };
+        if node.spec.kind != report.kind {
+            return Err(NodeError::KindChanged {
+                node: speaker.node.clone(),
+                was: node.spec.kind,
+                says: report.kind,
+            });
+        }
+        let before = node.clone();
+        fill(context, speaker, report, &mut node);
+        let mut ops = Vec::new();
+        if node != before {
+            ops.push(objects::replace(&stored, &node));
+        }
+        ops.extend(free_lease(context, speaker, report));
+        match context.store.apply(ops).await {
+            Ok(_) => return Ok(()),
+            Err(error) if objects::is_race(&error) => tokio::task::yield_now().await,
+            Err(error) => return Err(error.into()),
+        }
+    }
+}
+
+fn create(context: &Context, speaker: &Speaker, report: &NodeReport) -> Vec<Op> {
+    let spec = NodeSpec { kind: report.kind, unschedulable: false, taints: Vec::new(), speed: report.speed };
+    let mut node = Node::new(speaker.node.as_str(), spec);
+    objects::stamp_new(&mut node.metadata, context.clock.now());
+    fill(context, speaker, report, &mut node);
+    let mut ops = vec![objects::create(objects::node_key(speaker.node.as_str()), &node)];
+    ops.extend(free_lease(context, speaker, report));
+    ops
+}
+
+/// The Lease object of a robot's actuators, so that a free robot can be seen to be free.
+fn free_lease(context: &Context, speaker: &Speaker, report: &NodeReport) -> Option<Op> {
+    let key = objects::lease_key(speaker.node.as_str(), DEFAULT_GROUP);
+    if report.actuators.is_empty() {
+        return None;
+    }
+    let spec = LeaseSpec {
+        node: speaker.node.to_string(),
+        group: DEFAULT_GROUP.to_owned(),
+        actuators: report.actuators.clone(),
+    };
+    let Some(stored) = context.store.get(&key) else {
+        let mut lease = Lease::new(&key.name, spec);
+        objects::stamp_new(&mut lease.metadata, context.clock.now());
+        lease.status = Some(LeaseStatus::default());
+        return Some(objects::create(key, &lease));
+    };
+    let mut lease: Lease = objects::read(&stored)?;
+    if lease.spec == spec {
+        return None;
+    }
+    lease.spec = spec;
+    Some(objects::replace(&stored, &lease))
+}
+
+fn fill(context: &Context, speaker: &Speaker, report: &NodeReport, node: &mut Node) {
+    let now = context.clock.now();
+    node.metadata.labels.get_or_insert_default().extend(report.labels.clone());
+    if node.spec.speed.is_none() {
+        node.spec.speed = report.speed;
+    }
+    let status = node.status.get_or_insert_default();
+    status.capacity = report.capacity.clone();
+    status.allocatable = report.allocatable.clone();
+    if status.used == muster_api::resource::Compute::default() {
+        // Nothing is reserved: all of it is free. From then on the books say what is.
+        status.free = report.allocatable.clone();
+    }
+    status.sensors = report.sensors.clone();
+    status.actuators = report.actuators.clone();
+    status.runtimes = report.runtimes.clone();
+    status.incarnation = Some(speaker.incarnation.clone());
+    status.agent_version.clone_from(&speaker.version);
+    status.address.clone_from(&report.address);
+    if let Some(pose) = &report.pose
+        && status.pose.as_ref().is_none_or(|old| is_new_place(old, pose))
+    {
+        status.pose = Some(pose.clone());
+    }
+    for condition in &report.conditions {
+        set_condition(&mut status.conditions, condition.clone(), &Time(now));
+    }
+    let said: Vec<&str> = report.conditions.iter().map(|c| c.r#type.as_str()).collect();
+    status.conditions.retain(|c| c.r#type == condition::READY || said.contains(&c.r#type.as_str()));
+    set_ready(status, now);
+}
+
+fn set_ready(status: &mut NodeStatus, now: jiff::Timestamp) {
+    let ready = Condition {
+        r#type: condition::READY.to_owned(),
+        status: ConditionStatus::True,
+        reason: "AgentReady".to_owned(),
+        message: "its agent is connected".to_owned(),
+        last_transition_time: None,
+    };
+    if set_condition(&mut status.conditions, ready, &Time(now)) {
+        status.last_seen = Some(MicroTime(now));
+    }
+}
+
+/// A pose worth writing down: in another map, or a step away.
+fn is_new_place(old: &Pose, new: &Pose) -> bool {
+    old.map != new.map
+        || old.localized != new.localized
+        || old.source != new.source
+        || nalgebra::distance(&old.position(), &new.position()) >= POSE_STEP
+        || (old.position() != new.position() && new.source.starts_with("static"))
+}
+
+/// Writes a moved robot's pose down, when it moved a step.
+pub(crate) async fn write_pose(context: &Context, node: &NodeName, pose: &Pose) -> Result<(), StoreError> {
+    objects::change(&context.store, &objects::node_key(node.as_str()), |stored, mut object: Node| {
+        let status = object.status.get_or_insert_default();
+        if status.pose.as_ref().is_some_and(|old| !is_new_place(old, pose)) {
+            return None;
+        }
+        status.pose = Some(pose.clone());
+        Some(vec![objects::replace(stored, &object)])
+    })
+    .await
+    .map(drop)
+}

@@ -1,0 +1,195 @@
+//! Revisioned objects with durable writes and exact watches.
+//!
+//! ```text
+//!  writers ──Vec<Op>──▶ bounded mpsc ──▶ Writer task ──one commit a batch──▶ Backend (sqlite | memory)
+//!                                          │ after the commit, in revision order
+//!                                          ▼
+//!  readers ◀── get / list / list_at ── Shared { map of live objects, ring of recent events }
+//!  watchers ◀── Watcher (a cursor over the ring, woken by the published revision)
+//! ```
+//!
+//! | module | is |
+//! |---|---|
+//! | `handle` | [`Store`], the cloneable front that everybody holds |
+//! | `writer` | the one task that admits, commits and publishes; run and joined by whoever opened the store |
+//! | `pending` | preconditions against what the batch being gathered will leave behind |
+//! | `state` | what readers see: the map and the ring |
+//! | `watch` | cursors over the ring |
+//! | `document` | JSON with its resourceVersion spliced in |
+//! | `backend`, [`sqlite`], [`memory`] | where a batch becomes durable |
+//! | `contract` | the one suite that both backends pass |
+//!
+//! Reads never touch the disk: every live object is in memory as the JSON that was committed. A write is answered
+//! only after its batch is durable, and is visible to reads and watches before it is answered.
+
+mod backend;
+#[cfg(test)]
+mod contract;
+mod document;
+mod error;
+mod handle;
+mod key;
+pub mod memory;
+mod pending;
+#[cfg(test)]
+mod properties;
+pub mod sqlite;
+mod state;
+mod watch;
+mod writer;
+
+use std::sync::Arc;
+
+use bytes::Bytes;
+use serde::de::DeserializeOwned;
+use serde_json::Value;
+
+pub use backend::BackendError;
+pub use error::{OpenError, StoreError, UpdateError};
+pub use handle::Store;
+pub use key::{Key, Resource};
+pub use state::{Expired, Snapshot};
+pub use watch::{WatchEnd, WatchError, Watcher};
+pub use writer::Writer;
+
+/// One object as it was committed.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Stored {
+    /// Where the object lives.
+    pub key: Key,
+    /// The revision that wrote this state; equal to `metadata.resourceVersion` in `bytes`.
+    pub revision: u64,
+    /// `metadata.uid`, or empty for internal records that carry none.
+    pub uid: Box<str>,
+    /// The object as JSON, ready to be sent.
+    pub bytes: Bytes,
+}
+
+impl Stored {
+    /// The object as a JSON tree.
+    ///
+    /// # Panics
+    /// Never for an object of a store: only JSON that serde_json produced is stored.
+    #[must_use]
+    pub fn value(&self) -> Value {
+        serde_json::from_slice(&self.bytes).expect("stored bytes were rendered from JSON")
+    }
+
+    /// The object as a typed resource.
+    ///
+    /// # Errors
+    /// When the stored JSON does not have the shape of `T`.
+    pub fn parse<T: DeserializeOwned>(&self) -> Result<T, serde_json::Error> {
+        serde_json::from_slice(&self.bytes)
+    }
+}
+
+/// What must hold of the present object for an operation to be admitted.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub enum Precondition {
+    /// Nothing. A put creates or replaces; a delete still needs an object.
+    #[default]
+    Any,
+    /// No live object has this key.
+    Absent,
+    /// A live object has this key and is the named one.
+    Match {
+        /// Its present revision.
+        revision: Option<u64>,
+        /// Its uid, which tells an object from a namesake created after it.
+        uid: Option<String>,
+    },
+}
+
+impl Precondition {
+    /// The object exists, whatever it is.
+    pub const PRESENT: Self = Self::Match { revision: None, uid: None };
+
+    /// The object exists at exactly this revision.
+    #[must_use]
+    pub fn revision(revision: u64) -> Self {
+        Self::Match { revision: Some(revision), uid: None }
+    }
+
+    /// The object exists and has this uid.
+    #[must_use]
+    pub fn uid(uid: impl Into<String>) -> Self {
+        Self::Match { revision: None, uid: Some(uid.into()) }
+    }
+}
+
+/// One change of one object. A transaction is a `Vec<Op>` and is applied whole or not at all.
+#[derive(Debug, Clone)]
+pub enum Op {
+    /// Create or replace an object. `metadata.resourceVersion` in `value` is ignored and set by the store.
+    Put {
+        /// Where the object lives.
+        key: Key,
+        /// The whole object; `metadata` must be a JSON object.
+        value: Value,
+        /// What must hold.
+        precondition: Precondition,
+    },
+    /// Change nothing, but let the transaction pass only while this holds of another object.
+    Check {
+        /// The object that the transaction relies on.
+        key: Key,
+        /// What must hold.
+        precondition: Precondition,
+    },
+    /// Remove an object.
+    Delete {
+        /// Where the object lives.
+        key: Key,
+        /// What must hold.
+        precondition: Precondition,
+    },
+}
+
+impl Op {
+    /// A put that fails when the object already exists.
+    #[must_use]
+    pub fn create(key: Key, value: Value) -> Self {
+        Self::Put { key, value, precondition: Precondition::Absent }
+    }
+
+    /// A put that fails unless the object is still at `revision`.
+    #[must_use]
+    pub fn replace(key: Key, value: Value, revision: u64) -> Self {
+        Self::Put { key, value, precondition: Precondition::revision(revision) }
+    }
+
+    /// A removal that fails unless the object is still at `revision`.
+    #[must_use]
+    pub fn remove(key: Key, revision: u64) -> Self {
+        Self::Delete { key, precondition: Precondition::revision(revision) }
+    }
+}
+
+/// What an event did to its object.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Change {
+    /// Created or replaced; `previous` tells which.
+    Put,
+    /// Removed.
+    Delete,
+}
+
+/// One committed change.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Event {
+    /// What happened.
+    pub change: Change,
+    /// The new state; for a removal the last state with the removal's revision as its resourceVersion.
+    pub object: Arc<Stored>,
+    /// The state before, so that a selector can tell "no longer matches" from "never matched".
+    pub previous: Option<Arc<Stored>>,
+}
+
+impl Event {
+    /// The revision of this change.
+    #[must_use]
+    pub fn revision(&self) -> u64 {
+        self.object.revision
+    }
+}

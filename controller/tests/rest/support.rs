@@ -1,0 +1,157 @@
+//! A controller for one test, and clients for it.
+
+use std::path::PathBuf;
+
+use http::{Method, Request};
+use kube::Client;
+use kube::config::{KubeConfigOptions, Kubeconfig};
+use muster_controller::app::{self, Running};
+use muster_controller::config::Config;
+use serde_json::{Value, json};
+use tempfile::TempDir;
+
+pub(crate) const G: &str = "/apis/muster.dev/v1alpha1";
+pub(crate) const TASKS: &str = "/apis/muster.dev/v1alpha1/namespaces/default/tasks";
+pub(crate) const EVENTS: &str = "/api/v1/namespaces/default/events";
+
+pub(crate) struct Cluster {
+    pub(crate) running: Running,
+    pub(crate) dir: TempDir,
+}
+
+impl Cluster {
+    pub(crate) async fn start() -> Self {
+        let dir = tempfile::tempdir().unwrap();
+        let running = app::start(config(&dir)).await.unwrap();
+        Self { running, dir }
+    }
+
+    pub(crate) async fn restart(self) -> Self {
+        let Self { running, dir } = self;
+        running.shut_down().await.unwrap();
+        let running = app::start(config(&dir)).await.unwrap();
+        Self { running, dir }
+    }
+
+    pub(crate) fn kubeconfig(&self) -> PathBuf {
+        self.dir.path().join("kubeconfig")
+    }
+
+    async fn config(&self) -> kube::Config {
+        // Only the first caller of a process installs it, and any of them is as good.
+        drop(rustls::crypto::ring::default_provider().install_default());
+        let file = Kubeconfig::read_from(self.kubeconfig()).unwrap();
+        kube::Config::from_custom_kubeconfig(file, &KubeConfigOptions::default()).await.unwrap()
+    }
+
+    pub(crate) async fn admin(&self) -> Client {
+        Client::try_from(self.config().await).unwrap()
+    }
+
+    pub(crate) async fn anonymous(&self) -> Client {
+        let mut config = self.config().await;
+        config.auth_info = kube::config::AuthInfo::default();
+        Client::try_from(config).unwrap()
+    }
+
+    /// A client with a certificate of its own.
+    pub(crate) async fn holder(&self, certificate: &str, key: &str) -> Client {
+        use base64::Engine as _;
+        let encode = |text: &str| base64::engine::general_purpose::STANDARD.encode(text);
+        let mut config = self.config().await;
+        let key: kube::config::AuthInfo = serde_json::from_value(json!({
+            "client-certificate-data": encode(certificate),
+            "client-key-data": encode(key),
+        }))
+        .unwrap();
+        config.auth_info = key;
+        Client::try_from(config).unwrap()
+    }
+}
+
+fn config(dir: &TempDir) -> Config {
+    Config {
+        data_dir: dir.path().join("data"),
+        listen: "127.0.0.1:0".parse().unwrap(),
+        kubeconfig: dir.path().join("kubeconfig"),
+        advertise: Vec::new(),
+    }
+}
+
+/// Sends a request and gives back the code and the JSON.
+pub(crate) async fn send(client: &Client, method: &str, path: &str, body: Value) -> (u16, Value) {
+    let media = if method == "PATCH" { "application/merge-patch+json" } else { "application/json" };
+    send_as(client, method, path, media, body.to_string()).await
+}
+
+pub(crate) async fn send_as(
+    client: &Client,
+    method: &str,
+    path: &str,
+    media: &str,
+    body: String,
+) -> (u16, Value) {
+    let method: Method = method.parse().unwrap();
+    let body = if method == Method::GET { String::new() } else { body };
+    let request = Request::builder()
+        .method(method)
+        .uri(path)
+        .header("content-type", media)
+        .body(kube::client::Body::from(body.into_bytes()))
+        .unwrap();
+    let response = client.send(request).await.unwrap();
+    let code = response.status().as_u16();
+    let bytes = response.into_body().collect_bytes().await.unwrap();
+    let value = serde_json::from_slice(&bytes)
+        .unwrap_or_else(|_| Value::String(String::from_utf8_lossy(&bytes).into_owned()));
+    (code, value)
+}
+
+pub(crate) async fn get(client: &Client, path: &str) -> (u16, Value) {
+    send(client, "GET", path, Value::Null).await
+}
+
+/// A task that is good.
+pub(crate) fn task(name: &str) -> Value {
+    json!({
+        "apiVersion": "muster.dev/v1alpha1",
+        "kind": "Task",
+        "metadata": {"name": name, "labels": {"app": name}},
+        "spec": {"run": {"process": {"command": ["/bin/true"]}}},
+    })
+}
+
+/// An object that nothing in the controller works on, for tests of the conventions alone.
+pub(crate) fn event(name: &str) -> Value {
+    json!({
+        "apiVersion": "v1",
+        "kind": "Event",
+        "metadata": {"name": name, "labels": {"app": name}},
+        "involvedObject": {},
+        "reason": "Tested",
+        "type": "Normal",
+    })
+}
+
+/// Registers the robot `name`, which never connects.
+pub(crate) async fn register(client: &Client, name: &str) {
+    let node = json!({
+        "apiVersion": "muster.dev/v1alpha1",
+        "kind": "Node",
+        "metadata": {"name": name},
+        "spec": {"kind": "Robot"},
+    });
+    let (code, answer) = send(client, "POST", &format!("{G}/nodes"), node).await;
+    assert_eq!(code, 201, "{answer}");
+}
+
+/// The fields of a Status that tests look at.
+pub(crate) fn refusal((code, status): &(u16, Value)) -> (u16, &str) {
+    assert_eq!(status["kind"], "Status", "{status}");
+    (*code, status["reason"].as_str().unwrap())
+}
+
+pub(crate) fn names(list: &Value) -> Vec<&str> {
+    let items = list["items"].as_array().unwrap();
+    items.iter().map(|item| item["metadata"]["name"].as_str().unwrap()).collect()
+}
