@@ -1,0 +1,308 @@
+//! Starting, killing and restarting the daemons.
+
+use std::collections::BTreeMap;
+use std::fs::{self, File};
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+
+use http::Request;
+use kube::config::{KubeConfigOptions, Kubeconfig};
+use kube::{Api, Client, Config};
+use muster_api::kind::lease::Lease;
+use muster_api::kind::node::Node;
+use muster_api::kind::task::{Task, TaskStatus};
+use muster_api::phase::TaskPhase;
+use serde_json::{Value, json};
+use tempfile::TempDir;
+
+use crate::{kernel, wait};
+
+const API: &str = "/apis/muster.dev/v1alpha1";
+
+/// A cluster of real processes. When it is dropped, every process of it is killed, those of its
+/// tasks included, however the test ended.
+#[derive(Debug)]
+pub struct Cluster {
+    dir: TempDir,
+    controller: Option<Child>,
+    agents: BTreeMap<String, Agent>,
+    /// Taken from the kernel at the first start and kept for restarts.
+    listen: String,
+}
+
+#[derive(Debug)]
+struct Agent {
+    options: AgentOptions,
+    process: Option<Child>,
+}
+
+/// How an agent is started.
+#[derive(Debug, Clone)]
+pub struct AgentOptions {
+    /// The node's name.
+    pub name: String,
+    /// Everything else, as on the command line.
+    pub flags: Vec<String>,
+}
+
+impl AgentOptions {
+    /// A robot with a kinect and a base at a fixed place, metres.
+    #[must_use]
+    pub fn robot(name: &str, x: f64, y: f64) -> Self {
+        let flags = ["--kind", "robot", "--sr-res", "kinect:ImageGen;kinect:LaserGen", "--ar-res", "base:Drive;arm:Grasp"];
+        AgentOptions { name: name.to_owned(), flags: flags.map(str::to_owned).to_vec() }
+            .flag("--position", &format!("static:{x},{y}"))
+    }
+
+    /// A cloud server.
+    #[must_use]
+    pub fn cloud(name: &str) -> Self {
+        AgentOptions { name: name.to_owned(), flags: Vec::new() }.flag("--kind", "cloud")
+    }
+
+    /// Adds a flag.
+    #[must_use]
+    pub fn flag(mut self, flag: &str, value: &str) -> Self {
+        self.flags.extend([flag.to_owned(), value.to_owned()]);
+        self
+    }
+}
+
+/// The directory of the binaries that were built with this test.
+fn binary(name: &str) -> PathBuf {
+    let test = std::env::current_exe().expect("a test has a path");
+    let profile = test.parent().and_then(Path::parent).expect("tests are in target/PROFILE/deps");
+    let path = profile.join(name);
+    assert!(path.exists(), "{} is missing; `cargo build --workspace --bins` makes it (tests/run does)", path.display());
+    path
+}
+
+impl Cluster {
+    /// A controller without nodes.
+    pub async fn start() -> Self {
+        // Both TLS providers may be linked in; the one that is meant must be said.
+        drop(rustls::crypto::ring::default_provider().install_default());
+        let dir = TempDir::with_prefix("muster-test-").expect("a temporary directory");
+        let mut cluster =
+            Cluster { dir, controller: None, agents: BTreeMap::new(), listen: "127.0.0.1:0".to_owned() };
+        cluster.start_controller().await;
+        cluster
+    }
+
+    /// The directory with everything that the cluster writes.
+    #[must_use]
+    pub fn dir(&self) -> &Path {
+        self.dir.path()
+    }
+
+    /// The admin's kubeconfig.
+    #[must_use]
+    pub fn kubeconfig(&self) -> PathBuf {
+        self.dir.path().join("kubeconfig")
+    }
+
+    fn log(&self, name: &str) -> Stdio {
+        let path = self.dir.path().join(format!("{name}.log"));
+        File::options().create(true).append(true).open(path).expect("a log in the test's directory").into()
+    }
+
+    /// What a daemon wrote.
+    #[must_use]
+    pub fn log_of(&self, name: &str) -> String {
+        fs::read_to_string(self.dir.path().join(format!("{name}.log"))).unwrap_or_default()
+    }
+
+    /// Starts the controller (again, on the same port and data); returns when it is ready.
+    pub async fn start_controller(&mut self) {
+        assert!(self.controller.is_none(), "the controller runs");
+        let child = Command::new(binary("muster-controller"))
+            .args(["--listen", &self.listen, "--data-dir"])
+            .arg(self.dir.path().join("controller"))
+            .arg("--kubeconfig")
+            .arg(self.kubeconfig())
+            .stdin(Stdio::null())
+            .stdout(self.log("controller"))
+            .stderr(self.log("controller"))
+            .spawn()
+            .expect("the controller starts");
+        self.controller = Some(child);
+        let url = wait::until("ready", || async {
+            let client = self.try_client().await?;
+            let request = Request::get("/readyz").body(Vec::new()).expect("a request");
+            client.request_text(request).await.map_err(|e| format!("{e}: {}", self.log_of("controller")))?;
+            Ok(self.server_url())
+        })
+        .await;
+        url.trim_start_matches("https://").clone_into(&mut self.listen);
+    }
+
+    fn server_url(&self) -> String {
+        let kubeconfig = Kubeconfig::read_from(self.kubeconfig()).expect("written before it is ready");
+        kubeconfig.clusters[0].cluster.as_ref().and_then(|c| c.server.clone()).expect("a server")
+    }
+
+    /// Kills the controller as a power cut would end it.
+    pub fn kill_controller(&mut self) {
+        let mut child = self.controller.take().expect("the controller runs");
+        child.kill().expect("SIGKILL");
+        child.wait().expect("it is ours");
+    }
+
+    async fn try_client(&self) -> Result<Client, String> {
+        let kubeconfig = Kubeconfig::read_from(self.kubeconfig()).map_err(|e| e.to_string())?;
+        let config = Config::from_custom_kubeconfig(kubeconfig, &KubeConfigOptions::default())
+            .await
+            .map_err(|e| e.to_string())?;
+        Client::try_from(config).map_err(|e| e.to_string())
+    }
+
+    /// A client with the admin's credential.
+    pub async fn client(&self) -> Client {
+        self.try_client().await.expect("the kubeconfig is good")
+    }
+
+    /// A join token.
+    pub async fn token(&self) -> String {
+        let answer = self.post(&format!("{API}/jointokens"), &json!({})).await;
+        answer.pointer("/status/token").and_then(Value::as_str).expect("a token").to_owned()
+    }
+
+    /// POST as the admin; the answer's JSON.
+    pub async fn post(&self, path: &str, body: &Value) -> Value {
+        let request = Request::post(path).header("content-type", "application/json");
+        let request = request.body(serde_json::to_vec(body).expect("JSON")).expect("a request");
+        self.client().await.request(request).await.expect("the controller takes it")
+    }
+
+    /// GET as the admin; the answer's JSON.
+    pub async fn get(&self, path: &str) -> Value {
+        let request = Request::get(path).body(Vec::new()).expect("a request");
+        self.client().await.request(request).await.expect("the controller answers")
+    }
+
+    /// The log of a task of the default namespace.
+    pub async fn task_log(&self, task: &str) -> String {
+        let request = Request::get(format!("{API}/namespaces/default/tasks/{task}/log"));
+        let request = request.body(Vec::new()).expect("a request");
+        self.client().await.request_text(request).await.expect("a log")
+    }
+
+    /// Joins an agent; returns when its node is ready.
+    pub async fn join(&mut self, options: AgentOptions) {
+        let token = self.token().await;
+        let name = options.name.clone();
+        self.agents.insert(name.clone(), Agent { options, process: None });
+        self.spawn_agent(&name, Some(&token));
+        self.node_ready(&name).await;
+    }
+
+    fn spawn_agent(&mut self, name: &str, token: Option<&str>) {
+        let options = self.agents[name].options.clone();
+        let mut command = Command::new(binary("muster-agent"));
+        command
+            .args(["--join", &format!("https://{}", self.listen), "--name", name])
+            .arg("--data-dir")
+            .arg(self.dir.path().join(name))
+            .args(&options.flags)
+            .stdin(Stdio::null())
+            .stdout(self.log(name))
+            .stderr(self.log(name));
+        if let Some(token) = token {
+            command.args(["--token", token]);
+        }
+        let child = command.spawn().expect("the agent starts");
+        self.agents.get_mut(name).expect("known").process = Some(child);
+    }
+
+    /// Kills an agent as a power cut would end it; what it runs goes on.
+    pub fn kill_agent(&mut self, name: &str) {
+        let agent = self.agents.get_mut(name).expect("an agent of this cluster");
+        let mut child = agent.process.take().expect("it runs");
+        child.kill().expect("SIGKILL");
+        child.wait().expect("it is ours");
+    }
+
+    /// Starts a killed agent again, without a token.
+    pub async fn restart_agent(&mut self, name: &str) {
+        self.spawn_agent(name, None);
+        self.node_ready(name).await;
+    }
+
+    /// Waits until a node is ready.
+    pub async fn node_ready(&self, name: &str) -> Node {
+        let ready = |n: Option<&Node>| n.and_then(|n| n.status.as_ref()).is_some_and(|s| s.is_ready());
+        let node = wait::object(self.nodes().await, name, "ready", ready).await;
+        node.expect("it is ready, so it is there")
+    }
+
+    /// Nodes.
+    pub async fn nodes(&self) -> Api<Node> {
+        Api::all(self.client().await)
+    }
+
+    /// Leases.
+    pub async fn leases(&self) -> Api<Lease> {
+        Api::all(self.client().await)
+    }
+
+    /// Tasks of the default namespace.
+    pub async fn tasks(&self) -> Api<Task> {
+        Api::namespaced(self.client().await, "default")
+    }
+
+    /// Creates a task of the default namespace.
+    pub async fn create(&self, name: &str, spec: Value) -> Task {
+        let object = json!({
+            "apiVersion": muster_api::API_VERSION,
+            "kind": "Task",
+            "metadata": { "name": name },
+            "spec": spec,
+        });
+        let task: Task = serde_json::from_value(object).expect("a task");
+        self.tasks().await.create(&Default::default(), &task).await.expect("the task is taken")
+    }
+
+    /// Waits until a task's status satisfies `condition`.
+    pub async fn task(&self, name: &str, what: &str, condition: impl Fn(&TaskStatus) -> bool) -> Task {
+        let holds = |t: Option<&Task>| t.and_then(|t| t.status.as_ref()).is_some_and(&condition);
+        wait::object(self.tasks().await, name, what, holds).await.expect("it has a status, so it is there")
+    }
+
+    /// Waits until a task is in a phase.
+    pub async fn phase(&self, name: &str, phase: TaskPhase) -> Task {
+        self.task(name, phase.as_str(), |s| s.phase == phase).await
+    }
+
+    /// Deletes a task and waits until it is gone.
+    pub async fn delete(&self, name: &str) {
+        let api = self.tasks().await;
+        api.delete(name, &Default::default()).await.expect("it is there");
+        wait::object(api, name, "gone", |t| t.is_none()).await;
+    }
+}
+
+impl Drop for Cluster {
+    fn drop(&mut self) {
+        let children = self.controller.take().into_iter();
+        for mut child in children.chain(self.agents.values_mut().filter_map(|a| a.process.take())) {
+            // It may have ended by itself; either way it is gone afterwards.
+            drop(child.kill());
+            drop(child.wait());
+        }
+        // Tasks outlive their agents by design. Shims carry the data directory in their arguments,
+        // tasks in their environment.
+        let dir = self.dir.path().display().to_string();
+        let tasks = fs::read_dir("/proc").into_iter().flatten().flatten().filter_map(|e| e.file_name().to_str()?.parse::<u32>().ok());
+        let in_environment = tasks.filter(|pid| {
+            fs::read(format!("/proc/{pid}/environ")).is_ok_and(|e| String::from_utf8_lossy(&e).contains(&dir))
+        });
+        for pid in kernel::with_command(&dir).into_iter().chain(in_environment) {
+            drop(Command::new("kill").args(["-9", &pid.to_string()]).stderr(Stdio::null()).status());
+        }
+        if std::thread::panicking() {
+            for name in ["controller"].into_iter().chain(self.agents.keys().map(String::as_str)) {
+                eprintln!("--- {name} ---\n{}", self.log_of(name));
+            }
+        }
+    }
+}

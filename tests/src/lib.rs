@@ -1,0 +1,16 @@
+//! A cluster of real processes for the tests: one controller, any number of agents, all from the
+//! binaries that the same build made, in a directory of its own, on ports of the kernel's choice.
+//!
+//! | module | is |
+//! |---|---|
+//! | [`cluster`] | starting, killing and restarting the daemons; the API of the cluster |
+//! | [`wait`] | waiting for what a watch or the kernel shows, with a generous deadline |
+//! | [`kernel`] | what the kernel says: processes, start times, cgroups |
+//!
+//! A missing piece (a binary, root, Docker) fails the test that needs it; nothing is skipped.
+
+pub mod cluster;
+pub mod kernel;
+pub mod wait;
+
+pub use cluster::{AgentOptions, Cluster};

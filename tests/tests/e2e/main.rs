@@ -1,0 +1,6 @@
+//! The main job with real processes, cgroups, SQLite and Docker.
+
+mod figure4;
+mod lease;
+mod quotas;
+mod survival;
