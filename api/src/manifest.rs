@@ -138,7 +138,7 @@ pub fn parse(source: &str, text: &str) -> Result<Vec<Document>, ManifestError> {
             line: l.line() as usize,
             column: l.column() as usize,
         });
-        fail(location, error.without_snippet().to_string().lines().next().unwrap_or_default())
+        fail(location, &reason_of(&error))
     })?;
     let places = index(text).map_err(|error| {
         let marker = error.marker();
@@ -157,6 +157,18 @@ pub fn parse(source: &str, text: &str) -> Result<Vec<Document>, ManifestError> {
         documents.push(document);
     }
     Ok(documents)
+}
+
+/// The reader's reason without the place, which is said in front of it, and without advice for
+/// programmers.
+fn reason_of(error: &serde_saphyr::Error) -> String {
+    let text = error.without_snippet().to_string();
+    let line = text.lines().next().unwrap_or_default();
+    if let Some(key) = line.strip_prefix("duplicate mapping key: ") {
+        let key = key.split(',').next().unwrap_or_default();
+        return format!("the field {key:?} is there twice");
+    }
+    line.rsplit_once(" at line ").map_or(line, |(reason, _)| reason).to_owned()
 }
 
 /// What the walk over the events stands in.

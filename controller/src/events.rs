@@ -102,7 +102,11 @@ async fn write(context: &Context, happening: Happening) -> Result<(), StoreError
     let suffix = uuid::Uuid::new_v4().simple().to_string();
     let name = format!("{}.{}", happening.about.name.as_deref().unwrap_or("object"), &suffix[..12]);
     let mut event = Event {
-        metadata: ObjectMeta { name: Some(name.clone()), namespace: Some(namespace.clone()), ..ObjectMeta::default() },
+        metadata: ObjectMeta {
+            name: Some(name.clone()),
+            namespace: Some(namespace.clone()),
+            ..ObjectMeta::default()
+        },
         involved_object: happening.about,
         type_: Some(happening.kind.to_owned()),
         reason: Some(happening.reason.to_owned()),

@@ -108,7 +108,10 @@ pub fn release_lease(store: &Store, name: &str, uid: &str) -> Option<Op> {
 }
 
 /// Fields that the server owns, for objects that the controller itself creates.
-pub fn stamp_new(metadata: &mut k8s_openapi::apimachinery::pkg::apis::meta::v1::ObjectMeta, now: jiff::Timestamp) {
+pub fn stamp_new(
+    metadata: &mut k8s_openapi::apimachinery::pkg::apis::meta::v1::ObjectMeta,
+    now: jiff::Timestamp,
+) {
     metadata.uid = Some(uuid::Uuid::new_v4().to_string());
     let whole = jiff::Timestamp::from_second(now.as_second()).unwrap_or(now);
     metadata.creation_timestamp = Some(k8s_openapi::apimachinery::pkg::apis::meta::v1::Time(whole));
@@ -130,7 +133,8 @@ pub fn uid_of(metadata: &k8s_openapi::apimachinery::pkg::apis::meta::v1::ObjectM
 /// The key of a stored Task.
 #[must_use]
 pub fn task_key(task: &Task) -> Key {
-    let namespace = task.metadata.namespace.as_deref().unwrap_or(muster_api::kind::namespace::DEFAULT);
+    let namespace =
+        task.metadata.namespace.as_deref().unwrap_or(muster_api::kind::namespace::DEFAULT);
     Key::namespaced(TASKS, namespace, task.metadata.name.as_deref().unwrap_or_default())
 }
 

@@ -49,7 +49,14 @@ impl AgentOptions {
     /// A robot with a kinect and a base at a fixed place, metres.
     #[must_use]
     pub fn robot(name: &str, x: f64, y: f64) -> Self {
-        let flags = ["--kind", "robot", "--sr-res", "kinect:ImageGen;kinect:LaserGen", "--ar-res", "base:Drive;arm:Grasp"];
+        let flags = [
+            "--kind",
+            "robot",
+            "--sr-res",
+            "kinect:ImageGen;kinect:LaserGen",
+            "--ar-res",
+            "base:Drive;arm:Grasp",
+        ];
         AgentOptions { name: name.to_owned(), flags: flags.map(str::to_owned).to_vec() }
             .flag("--position", &format!("static:{x},{y}"))
     }
@@ -73,7 +80,11 @@ fn binary(name: &str) -> PathBuf {
     let test = std::env::current_exe().expect("a test has a path");
     let profile = test.parent().and_then(Path::parent).expect("tests are in target/PROFILE/deps");
     let path = profile.join(name);
-    assert!(path.exists(), "{} is missing; `cargo build --workspace --bins` makes it (tests/run does)", path.display());
+    assert!(
+        path.exists(),
+        "{} is missing; `cargo build --workspace --bins` makes it (tests/run does)",
+        path.display()
+    );
     path
 }
 
@@ -83,8 +94,12 @@ impl Cluster {
         // Both TLS providers may be linked in; the one that is meant must be said.
         drop(rustls::crypto::ring::default_provider().install_default());
         let dir = TempDir::with_prefix("muster-test-").expect("a temporary directory");
-        let mut cluster =
-            Cluster { dir, controller: None, agents: BTreeMap::new(), listen: "127.0.0.1:0".to_owned() };
+        let mut cluster = Cluster {
+            dir,
+            controller: None,
+            agents: BTreeMap::new(),
+            listen: "127.0.0.1:0".to_owned(),
+        };
         cluster.start_controller().await;
         cluster
     }
@@ -103,7 +118,12 @@ impl Cluster {
 
     fn log(&self, name: &str) -> Stdio {
         let path = self.dir.path().join(format!("{name}.log"));
-        File::options().create(true).append(true).open(path).expect("a log in the test's directory").into()
+        File::options()
+            .create(true)
+            .append(true)
+            .open(path)
+            .expect("a log in the test's directory")
+            .into()
     }
 
     /// What a daemon wrote.
@@ -129,7 +149,10 @@ impl Cluster {
         let url = wait::until("ready", || async {
             let client = self.try_client().await?;
             let request = Request::get("/readyz").body(Vec::new()).expect("a request");
-            client.request_text(request).await.map_err(|e| format!("{e}: {}", self.log_of("controller")))?;
+            client
+                .request_text(request)
+                .await
+                .map_err(|e| format!("{e}: {}", self.log_of("controller")))?;
             Ok(self.server_url())
         })
         .await;
@@ -137,7 +160,8 @@ impl Cluster {
     }
 
     fn server_url(&self) -> String {
-        let kubeconfig = Kubeconfig::read_from(self.kubeconfig()).expect("written before it is ready");
+        let kubeconfig =
+            Kubeconfig::read_from(self.kubeconfig()).expect("written before it is ready");
         kubeconfig.clusters[0].cluster.as_ref().and_then(|c| c.server.clone()).expect("a server")
     }
 
@@ -230,7 +254,8 @@ impl Cluster {
 
     /// Waits until a node is ready.
     pub async fn node_ready(&self, name: &str) -> Node {
-        let ready = |n: Option<&Node>| n.and_then(|n| n.status.as_ref()).is_some_and(|s| s.is_ready());
+        let ready =
+            |n: Option<&Node>| n.and_then(|n| n.status.as_ref()).is_some_and(|s| s.is_ready());
         let node = wait::object(self.nodes().await, name, "ready", ready).await;
         node.expect("it is ready, so it is there")
     }
@@ -263,9 +288,16 @@ impl Cluster {
     }
 
     /// Waits until a task's status satisfies `condition`.
-    pub async fn task(&self, name: &str, what: &str, condition: impl Fn(&TaskStatus) -> bool) -> Task {
+    pub async fn task(
+        &self,
+        name: &str,
+        what: &str,
+        condition: impl Fn(&TaskStatus) -> bool,
+    ) -> Task {
         let holds = |t: Option<&Task>| t.and_then(|t| t.status.as_ref()).is_some_and(&condition);
-        wait::object(self.tasks().await, name, what, holds).await.expect("it has a status, so it is there")
+        wait::object(self.tasks().await, name, what, holds)
+            .await
+            .expect("it has a status, so it is there")
     }
 
     /// Waits until a task is in a phase.
@@ -292,12 +324,19 @@ impl Drop for Cluster {
         // Tasks outlive their agents by design. Shims carry the data directory in their arguments,
         // tasks in their environment.
         let dir = self.dir.path().display().to_string();
-        let tasks = fs::read_dir("/proc").into_iter().flatten().flatten().filter_map(|e| e.file_name().to_str()?.parse::<u32>().ok());
+        let tasks = fs::read_dir("/proc")
+            .into_iter()
+            .flatten()
+            .flatten()
+            .filter_map(|e| e.file_name().to_str()?.parse::<u32>().ok());
         let in_environment = tasks.filter(|pid| {
-            fs::read(format!("/proc/{pid}/environ")).is_ok_and(|e| String::from_utf8_lossy(&e).contains(&dir))
+            fs::read(format!("/proc/{pid}/environ"))
+                .is_ok_and(|e| String::from_utf8_lossy(&e).contains(&dir))
         });
         for pid in kernel::with_command(&dir).into_iter().chain(in_environment) {
-            drop(Command::new("kill").args(["-9", &pid.to_string()]).stderr(Stdio::null()).status());
+            drop(
+                Command::new("kill").args(["-9", &pid.to_string()]).stderr(Stdio::null()).status(),
+            );
         }
         if std::thread::panicking() {
             for name in ["controller"].into_iter().chain(self.agents.keys().map(String::as_str)) {

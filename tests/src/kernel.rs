@@ -18,7 +18,9 @@ pub fn with_env(name: &str, value: &str) -> Vec<Process> {
     let wanted = format!("{name}={value}");
     let mut found = Vec::new();
     for entry in fs::read_dir("/proc").expect("procfs is mounted").flatten() {
-        let Some(pid) = entry.file_name().to_str().and_then(|n| n.parse::<u32>().ok()) else { continue };
+        let Some(pid) = entry.file_name().to_str().and_then(|n| n.parse::<u32>().ok()) else {
+            continue;
+        };
         // A process may end between the listing and the reading; then it is not there.
         let Ok(environment) = fs::read(format!("/proc/{pid}/environ")) else { continue };
         if environment.split(|b| *b == 0).any(|var| var == wanted.as_bytes())
@@ -45,7 +47,9 @@ pub fn start_time(pid: u32) -> Option<u64> {
 pub fn with_command(text: &str) -> Vec<u32> {
     let mut found = Vec::new();
     for entry in fs::read_dir("/proc").expect("procfs is mounted").flatten() {
-        let Some(pid) = entry.file_name().to_str().and_then(|n| n.parse::<u32>().ok()) else { continue };
+        let Some(pid) = entry.file_name().to_str().and_then(|n| n.parse::<u32>().ok()) else {
+            continue;
+        };
         let Ok(command) = fs::read(format!("/proc/{pid}/cmdline")) else { continue };
         if String::from_utf8_lossy(&command).contains(text) {
             found.push(pid);
@@ -62,7 +66,11 @@ pub fn cgroup_cpu_time(pid: u32) -> Option<Duration> {
         let mut parts = line.splitn(3, ':');
         let (_, controllers, path) = (parts.next()?, parts.next()?, parts.next()?);
         if controllers.split(',').any(|c| c == "cpuacct") {
-            let root = if controllers == "cpuacct" { "/sys/fs/cgroup/cpuacct".to_owned() } else { format!("/sys/fs/cgroup/{controllers}") };
+            let root = if controllers == "cpuacct" {
+                "/sys/fs/cgroup/cpuacct".to_owned()
+            } else {
+                format!("/sys/fs/cgroup/{controllers}")
+            };
             let usage = fs::read_to_string(format!("{root}{path}/cpuacct.usage")).ok()?;
             return Some(Duration::from_nanos(usage.trim().parse().ok()?));
         }

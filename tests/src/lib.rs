@@ -5,11 +5,13 @@
 //! |---|---|
 //! | [`cluster`] | starting, killing and restarting the daemons; the API of the cluster |
 //! | [`wait`] | waiting for what a watch or the kernel shows, with a generous deadline |
+//! | [`docker`] | an image without a registry |
 //! | [`kernel`] | what the kernel says: processes, start times, cgroups |
 //!
 //! A missing piece (a binary, root, Docker) fails the test that needs it; nothing is skipped.
 
 pub mod cluster;
+pub mod docker;
 pub mod kernel;
 pub mod wait;
 

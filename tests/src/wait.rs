@@ -17,7 +17,12 @@ pub const DEADLINE: Duration = Duration::from_secs(60);
 ///
 /// When the deadline passes, with the state seen last.
 #[track_caller]
-pub fn object<K, F>(api: Api<K>, name: &str, what: &str, condition: F) -> impl Future<Output = Option<K>>
+pub fn object<K, F>(
+    api: Api<K>,
+    name: &str,
+    what: &str,
+    condition: F,
+) -> impl Future<Output = Option<K>>
 where
     K: Resource + Clone + Debug + Send + serde::de::DeserializeOwned + 'static,
     F: Fn(Option<&K>) -> bool,
@@ -48,7 +53,10 @@ where
 /// # Panics
 ///
 /// When the deadline passes, with what the probe said last.
-pub async fn until<T, F: Future<Output = Result<T, String>>>(what: &str, mut probe: impl FnMut() -> F) -> T {
+pub async fn until<T, F: Future<Output = Result<T, String>>>(
+    what: &str,
+    mut probe: impl FnMut() -> F,
+) -> T {
     let mut last = String::new();
     let mut ticks = tokio::time::interval(Duration::from_millis(20));
     let waited = tokio::time::timeout(DEADLINE, async {

@@ -222,8 +222,8 @@ fn admit_spec<S: JsonSchema + Serialize + DeserializeOwned + 'static>(
     };
     let mut found = Violations::new();
     crate::validate::walk_schema(&schema_of::<S>(), spec, "spec", &mut found);
+    remove_nulls(spec);
     if found.is_empty() {
-        remove_nulls(spec);
         match serde_path_to_error::deserialize::<_, S>(&*spec) {
             Ok(typed) => {
                 rules(&typed, &mut found);
@@ -235,8 +235,38 @@ fn admit_spec<S: JsonSchema + Serialize + DeserializeOwned + 'static>(
                 found.invalid(path, error.inner().to_string());
             }
         }
+    } else {
+        found.extend(rules_on_the_rest(spec, &found, rules));
     }
     violations.extend(found);
+}
+
+/// What a kind's own rules find in a spec whose schema violations are cut out of it, so that one
+/// reading finds both sorts. Nothing, when what is left does not make a spec.
+fn rules_on_the_rest<S: DeserializeOwned>(
+    spec: &Value,
+    found: &Violations,
+    rules: fn(&S, &mut Violations),
+) -> Violations {
+    let mut rest = spec.clone();
+    let mut cut = Vec::new();
+    for violation in found.iter() {
+        // A list without one of its elements would number the others anew: the list goes whole.
+        let path = violation.path.split('[').next().unwrap_or_default();
+        let pointer = path.strip_prefix("spec").unwrap_or_default().replace('.', "/");
+        let Some((parent, member)) = pointer.rsplit_once('/') else { return Violations::new() };
+        if let Some(members) = rest.pointer_mut(parent).and_then(Value::as_object_mut) {
+            members.remove(member);
+        }
+        cut.push(path.to_owned());
+    }
+    let mut more = Violations::new();
+    if let Ok(typed) = serde_json::from_value::<S>(rest) {
+        rules(&typed, &mut more);
+    }
+    // What is missing because it was cut out, or is about something around it, is said already.
+    more.retain(|v| !cut.iter().any(|c| c.starts_with(&v.path) || v.path.starts_with(c.as_str())));
+    more
 }
 
 fn remove_nulls(value: &mut Value) {

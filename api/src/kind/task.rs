@@ -44,6 +44,7 @@ pub struct TaskSpec {
     #[serde(default)]
     pub resources: Resources,
     /// The program.
+    #[serde(default)]
     pub run: Run,
     /// What happens when the program ends.
     #[serde(default)]

@@ -30,13 +30,22 @@ impl From<&NodeLedger> for Page {
     fn from(ledger: &NodeLedger) -> Self {
         let lease = |(name, group): (&str, &muster_controller_core::ledger::Group)| {
             let holder = group.holder.as_ref().map(|uid| {
-                let title = ledger.reservation(uid).map(|r| r.title.to_string()).unwrap_or_default();
+                let title =
+                    ledger.reservation(uid).map(|r| r.title.to_string()).unwrap_or_default();
                 let (namespace, name) = title.split_once('/').unwrap_or_default();
-                LeaseHolder { namespace: namespace.to_owned(), name: name.to_owned(), uid: uid.clone() }
+                LeaseHolder {
+                    namespace: namespace.to_owned(),
+                    name: name.to_owned(),
+                    uid: uid.clone(),
+                }
             });
             NodeLease { group: name.to_owned(), epoch: group.epoch, holder }
         };
-        Page { used: ledger.used().clone(), free: ledger.free(), leases: ledger.groups().map(lease).collect() }
+        Page {
+            used: ledger.used().clone(),
+            free: ledger.free(),
+            leases: ledger.groups().map(lease).collect(),
+        }
     }
 }
 
@@ -44,7 +53,8 @@ impl Page {
     /// What is written is what is so.
     #[must_use]
     pub fn is_written(&self, status: Option<&NodeStatus>) -> bool {
-        status.is_some_and(|s| s.used == self.used && s.free == self.free && s.leases == self.leases)
+        status
+            .is_some_and(|s| s.used == self.used && s.free == self.free && s.leases == self.leases)
     }
 
     fn write(&self, status: &mut NodeStatus) {

@@ -58,13 +58,17 @@ impl Graph {
                 self.owners.insert(stored.key.clone(), owners);
             }
         }
-        if mentions(b"\"deletionTimestamp\"") && (mentions(FOREGROUND.as_bytes()) || mentions(ORPHAN.as_bytes())) {
+        if mentions(b"\"deletionTimestamp\"")
+            && (mentions(FOREGROUND.as_bytes()) || mentions(ORPHAN.as_bytes()))
+        {
             self.waiting.insert(stored.key.clone(), stored.uid.clone());
         }
     }
 
     fn lost(&self, key: &Key) -> bool {
-        self.owners.get(key).is_some_and(|owners| !owners.iter().any(|o| self.live.contains_key(o.as_str())))
+        self.owners
+            .get(key)
+            .is_some_and(|owners| !owners.iter().any(|o| self.live.contains_key(o.as_str())))
     }
 }
 
@@ -108,7 +112,9 @@ async fn follow(context: &Context) -> Result<(), StoreError> {
                 Change::Put => {
                     look.insert(event.object.key.clone());
                 }
-                Change::Delete => look.extend(graph.dependents.get(&*event.object.uid).into_iter().flatten().cloned()),
+                Change::Delete => look.extend(
+                    graph.dependents.get(&*event.object.uid).into_iter().flatten().cloned(),
+                ),
             }
         }
     }
@@ -119,7 +125,10 @@ async fn finish(context: &Context, graph: &Graph, key: &Key, uid: &str) -> Resul
     let Some(stored) = context.store.get(key) else { return Ok(()) };
     let object = stored.value();
     let has = |name: &str| {
-        object.pointer("/metadata/finalizers").and_then(Value::as_array).is_some_and(|f| f.iter().any(|x| x == name))
+        object
+            .pointer("/metadata/finalizers")
+            .and_then(Value::as_array)
+            .is_some_and(|f| f.iter().any(|x| x == name))
     };
     let dependents: Vec<&Key> = graph.dependents.get(uid).into_iter().flatten().collect();
     if has(ORPHAN) {
@@ -138,13 +147,23 @@ async fn finish(context: &Context, graph: &Graph, key: &Key, uid: &str) -> Resul
             drop(delete_object(context, dependent).await);
         }
     }
-    if left == 0 { update(context, key, |object| remove_finalizer(object, FOREGROUND)).await } else { Ok(()) }
+    if left == 0 {
+        update(context, key, |object| remove_finalizer(object, FOREGROUND)).await
+    } else {
+        Ok(())
+    }
 }
 
-async fn update(context: &Context, key: &Key, change: impl Fn(&mut Value) -> bool + Send + Sync) -> Result<(), StoreError> {
+async fn update(
+    context: &Context,
+    key: &Key,
+    change: impl Fn(&mut Value) -> bool + Send + Sync,
+) -> Result<(), StoreError> {
     let written = context
         .store
-        .update(key, |_, mut object| Ok::<_, std::convert::Infallible>(change(&mut object).then_some(object)))
+        .update(key, |_, mut object| {
+            Ok::<_, std::convert::Infallible>(change(&mut object).then_some(object))
+        })
         .await;
     match written {
         Ok(_) | Err(UpdateError::Store(StoreError::NotFound { .. })) => {}
@@ -164,14 +183,20 @@ async fn update(context: &Context, key: &Key, change: impl Fn(&mut Value) -> boo
 }
 
 fn remove_finalizer(object: &mut Value, name: &str) -> bool {
-    let Some(list) = object.pointer_mut("/metadata/finalizers").and_then(Value::as_array_mut) else { return false };
+    let Some(list) = object.pointer_mut("/metadata/finalizers").and_then(Value::as_array_mut)
+    else {
+        return false;
+    };
     let before = list.len();
     list.retain(|f| f != name);
     list.len() != before
 }
 
 fn remove_reference(object: &mut Value, uid: &str) -> bool {
-    let Some(list) = object.pointer_mut("/metadata/ownerReferences").and_then(Value::as_array_mut) else { return false };
+    let Some(list) = object.pointer_mut("/metadata/ownerReferences").and_then(Value::as_array_mut)
+    else {
+        return false;
+    };
     let before = list.len();
     list.retain(|r| r["uid"] != uid);
     list.len() != before

@@ -41,7 +41,8 @@ pub async fn run(context: Arc<Context>, sessions: Arc<Sessions>) {
             () = sessions.health_changed() => continue,
         }
         let lost = sessions.silent_nodes();
-        join_all(lost.into_iter().map(|(node, silence)| mark(&context, &sessions, node, silence))).await;
+        join_all(lost.into_iter().map(|(node, silence)| mark(&context, &sessions, node, silence)))
+            .await;
     }
 }
 
@@ -72,33 +73,45 @@ async fn mark_once(
 ) -> Result<(), StoreError> {
     let now = context.clock.now();
     let heard = now.checked_sub(silence).unwrap_or(now);
-    let changed = objects::change(&context.store, &objects::node_key(node.as_str()), |stored, mut object: Node| {
-        // It may have come back while this waited for the store.
-        if sessions.is_heard(node) {
-            return None;
-        }
-        let status = object.status.get_or_insert_default();
-        status.last_seen = Some(MicroTime(heard));
-        let condition = Condition {
-            r#type: condition::READY.to_owned(),
-            status: ConditionStatus::Unknown,
-            reason: "AgentSilent".to_owned(),
-            message: format!("its agent has not been heard since {heard:.0}"),
-            last_transition_time: None,
-        };
-        set_condition(&mut status.conditions, condition, &Time(now));
-        Some(vec![objects::replace(stored, &object)])
-    })
+    let changed = objects::change(
+        &context.store,
+        &objects::node_key(node.as_str()),
+        |stored, mut object: Node| {
+            // It may have come back while this waited for the store.
+            if sessions.is_heard(node) {
+                return None;
+            }
+            let status = object.status.get_or_insert_default();
+            status.last_seen = Some(MicroTime(heard));
+            let condition = Condition {
+                r#type: condition::READY.to_owned(),
+                status: ConditionStatus::Unknown,
+                reason: "AgentSilent".to_owned(),
+                message: format!("its agent has not been heard since {heard:.0}"),
+                last_transition_time: None,
+            };
+            set_condition(&mut status.conditions, condition, &Time(now));
+            Some(vec![objects::replace(stored, &object)])
+        },
+    )
     .await?;
     if changed.is_none() {
         return Ok(());
     }
-    context.events.warn_node(node.as_str(), "NodeSilent", format!("the agent has not been heard for {silence:.1?}"));
+    context.events.warn_node(
+        node.as_str(),
+        "NodeSilent",
+        format!("the agent has not been heard for {silence:.1?}"),
+    );
     for key in sessions.board().tasks_on(node) {
         objects::change(&context.store, &key, |stored, mut task: Task| {
             let status = task.status.get_or_insert_default();
             let here = status.node.as_deref() == Some(node.as_str());
-            if !here || !status.phase.holds_node() || status.phase == TaskPhase::Unknown || sessions.is_heard(node) {
+            if !here
+                || !status.phase.holds_node()
+                || status.phase == TaskPhase::Unknown
+                || sessions.is_heard(node)
+            {
                 return None;
             }
             status.message = format!("node {node} cannot be reached; it was {}", status.phase);

@@ -28,12 +28,19 @@ pub async fn run(context: Arc<Context>) {
                 .iter()
                 .find_map(|p| value.pointer(p)?.as_str()?.parse::<Timestamp>().ok());
             let old = stamp.is_none_or(|s| now.duration_since(s).unsigned_abs() > EVENT_LIFE);
-            if old && let Err(error) = context.store.delete(stored.key.clone(), Precondition::revision(stored.revision)).await {
+            if old
+                && let Err(error) = context
+                    .store
+                    .delete(stored.key.clone(), Precondition::revision(stored.revision))
+                    .await
+            {
                 tracing::debug!(key = %stored.key, %error, "an old event is not removed yet");
             }
         }
         let through = context.store.revision().saturating_sub(KEEP_REVISIONS);
-        if through > 0 && let Err(error) = context.store.compact(through).await {
+        if through > 0
+            && let Err(error) = context.store.compact(through).await
+        {
             tracing::warn!(error = crate::app::chain(&error), "history is not compacted");
         }
     }

@@ -78,7 +78,9 @@ pub(crate) async fn watch_from_now(store: &Store) -> Watcher {
         match store.watch_all(store.revision()) {
             Ok(watcher) => return watcher,
             // Compaction may pass the revision between the two calls.
-            Err(WatchError::Expired(_) | WatchError::Ahead { .. }) => tokio::task::yield_now().await,
+            Err(WatchError::Expired(_) | WatchError::Ahead { .. }) => {
+                tokio::task::yield_now().await
+            }
         }
     }
 }

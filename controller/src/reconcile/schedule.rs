@@ -159,7 +159,11 @@ impl Scheduler {
                 self.take_in(resource, Change::Put, &stored);
             }
         }
-        tracing::info!(nodes = self.cluster.members().count(), waiting = self.waiting.len(), "scheduler is up to date");
+        tracing::info!(
+            nodes = self.cluster.members().count(),
+            waiting = self.waiting.len(),
+            "scheduler is up to date"
+        );
         watcher
     }
 
@@ -186,7 +190,12 @@ impl Scheduler {
             let Some(lease) = objects::read::<Lease>(stored) else { return };
             let Ok(node) = NodeName::new(lease.spec.node.clone()) else { return };
             let status = lease.status.unwrap_or_default();
-            self.cluster.set_lease(&node, &lease.spec.group, status.epoch, status.holder.map(|h| h.uid));
+            self.cluster.set_lease(
+                &node,
+                &lease.spec.group,
+                status.epoch,
+                status.holder.map(|h| h.uid),
+            );
         }
     }
 
@@ -215,18 +224,32 @@ impl Scheduler {
         match (status.phase, status.node) {
             (TaskPhase::Pending, _) if task.metadata.deletion_timestamp.is_none() => {
                 let since = self.waiting.get(&uid).map_or(stored.revision, |w| w.demand.since);
-                let title = format!("{}/{}", stored.key.namespace().unwrap_or_default(), stored.key.name);
-                let demand = Demand { uid: uid.clone(), title: title.into(), spec: Arc::new(task.spec), since };
+                let title =
+                    format!("{}/{}", stored.key.namespace().unwrap_or_default(), stored.key.name);
+                let demand = Demand {
+                    uid: uid.clone(),
+                    title: title.into(),
+                    spec: Arc::new(task.spec),
+                    since,
+                };
                 let written_at = Instant::now();
-                self.waiting.insert(uid, Waiting { demand, stored: Arc::clone(stored), written: status.why, written_at });
+                self.waiting.insert(
+                    uid,
+                    Waiting { demand, stored: Arc::clone(stored), written: status.why, written_at },
+                );
             }
             (phase, Some(node)) if phase.holds_node() => {
                 self.waiting.remove(&uid);
                 let Ok(node) = NodeName::new(node) else { return };
-                let title = format!("{}/{}", stored.key.namespace().unwrap_or_default(), stored.key.name);
+                let title =
+                    format!("{}/{}", stored.key.namespace().unwrap_or_default(), stored.key.name);
                 let compute = task.spec.resources.reserved();
                 // Which groups it holds is said by the Lease objects.
-                self.cluster.book(&uid, &node, Reservation { title: title.into(), compute, groups: Vec::new() });
+                self.cluster.book(
+                    &uid,
+                    &node,
+                    Reservation { title: title.into(), compute, groups: Vec::new() },
+                );
                 self.dirty.insert(node);
             }
             _ => self.forget(&uid),
@@ -247,7 +270,9 @@ impl Scheduler {
             Question::Why { uid, spec, answer } => {
                 let demand = Demand { uid, title: "".into(), spec, since: 0 };
                 let why = schedule::explain(&self.cluster, &demand);
-                drop(answer.send(why.iter().map(|(node, refusal)| refusal.of_node(node.as_str())).collect()));
+                drop(answer.send(
+                    why.iter().map(|(node, refusal)| refusal.of_node(node.as_str())).collect(),
+                ));
             }
             Question::Pose { node, pose } => self.cluster.set_pose(&node, &pose),
         }
@@ -258,7 +283,8 @@ impl Scheduler {
     async fn pass(&mut self) -> Option<Instant> {
         let mut retry = None;
         if !self.waiting.is_empty() {
-            let mut demands: Vec<Demand> = self.waiting.values().map(|w| w.demand.clone()).collect();
+            let mut demands: Vec<Demand> =
+                self.waiting.values().map(|w| w.demand.clone()).collect();
             let plan = schedule::schedule(&mut self.cluster, &mut demands);
             let binds = self.bind_all(plan.binds).await;
             let waits = self.write_reasons(plan.waits).await;
@@ -273,7 +299,8 @@ impl Scheduler {
     }
 
     async fn bind_all(&mut self, binds: Vec<Bind>) -> Option<Instant> {
-        let transactions: Vec<Option<Vec<Op>>> = binds.iter().map(|bind| self.bind_ops(bind)).collect();
+        let transactions: Vec<Option<Vec<Op>>> =
+            binds.iter().map(|bind| self.bind_ops(bind)).collect();
         let store = &self.context.store;
         let apply = |ops: Option<Vec<Op>>| async move {
             match ops {
@@ -335,7 +362,12 @@ impl Scheduler {
                 name: task.metadata.name.clone().unwrap_or_default(),
                 uid: bind.uid.clone(),
             };
-            let status = LeaseStatus { epoch: *epoch, holder: Some(holder), acquired: Some(now.clone()), renewed: None };
+            let status = LeaseStatus {
+                epoch: *epoch,
+                holder: Some(holder),
+                acquired: Some(now.clone()),
+                renewed: None,
+            };
             ops.push(self.grant_op(bind.node.as_str(), group, status));
         }
         Some(ops)
@@ -344,11 +376,14 @@ impl Scheduler {
     fn grant_op(&self, node: &str, group: &str, status: LeaseStatus) -> Op {
         let key: Key = objects::lease_key(node, group);
         let present = self.context.store.get(&key);
-        if let Some((stored, mut lease)) = present.and_then(|s| objects::read::<Lease>(&s).map(|l| (s, l))) {
+        if let Some((stored, mut lease)) =
+            present.and_then(|s| objects::read::<Lease>(&s).map(|l| (s, l)))
+        {
             lease.status = Some(status);
             return objects::replace(&stored, &lease);
         }
-        let spec = LeaseSpec { node: node.to_owned(), group: group.to_owned(), actuators: Vec::new() };
+        let spec =
+            LeaseSpec { node: node.to_owned(), group: group.to_owned(), actuators: Vec::new() };
         let mut lease = Lease::new(&key.name, spec);
         objects::stamp_new(&mut lease.metadata, self.context.clock.now());
         lease.status = Some(status);
@@ -361,7 +396,9 @@ impl Scheduler {
         let mut later = None;
         let mut due = Vec::new();
         for Wait { uid, why } in waits {
-            let Some(waiting) = self.waiting.get(&uid).filter(|w| w.written != why) else { continue };
+            let Some(waiting) = self.waiting.get(&uid).filter(|w| w.written != why) else {
+                continue;
+            };
             let at = waiting.written_at + WHY_EVERY;
             if (same_reasons(&waiting.written, &why) && at > now) || due.len() == WHY_AT_ONCE {
                 let at = at.max(now + WHY_EVERY / 10);

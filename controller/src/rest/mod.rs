@@ -1,6 +1,6 @@
 //! Kubernetes API conventions over the store.
 //!
-//! Every request is first read as a verb on a [`path::Target`], then authorised, then answered by one file a verb:
+//! Every request is first read as a verb on a `path::Target`, then authorised, then answered by one file a verb:
 //!
 //! | file | answers |
 //! |---|---|
@@ -8,7 +8,7 @@
 //! | `query`, `body` | parameters; JSON bodies with their limit |
 //! | `registry` | what is served: one entry a kind |
 //! | `discovery` | /api, /apis, resource lists, /version |
-//! | [`create`], [`list`], [`watch`], [`update`], [`patch`], [`delete`] | verbs on objects |
+//! | [`create`], `list`, `watch`, `update`, `patch`, [`delete`] | verbs on objects |
 //! | `metadata`, `admission` | server-owned fields; violations, unknown fields |
 //! | `selector` | label and field selectors |
 //! | [`namespace`] | the default namespace; ending of namespaces |

@@ -1,7 +1,7 @@
 //! Namespaces: the default one, who may create inside, and how one ends.
 //!
 //! Deleting a namespace sets it Terminating. A create names the namespace's revision as a condition of its own commit,
-//! so none slips in after that; [`finalize`] deletes what is inside and then the namespace.
+//! so none slips in after that; `finalize` deletes what is inside and then the namespace.
 
 use std::sync::Arc;
 use std::time::Duration;

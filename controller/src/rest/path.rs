@@ -178,7 +178,11 @@ pub(crate) fn read(method: &Method, uri: &Uri) -> Result<(Verb, Target), Failure
     let verb = verb(method, uri, named).ok_or_else(|| Failure::method(method))?;
     let read_only = matches!(
         target,
-        Target::Health(_) | Target::Metrics | Target::Version | Target::Discovery(_) | Target::Usage
+        Target::Health(_)
+            | Target::Metrics
+            | Target::Version
+            | Target::Discovery(_)
+            | Target::Usage
     );
     let post_only = matches!(target, Target::Join | Target::Plan);
     if read_only && verb != Verb::Get || post_only && verb != Verb::Create {

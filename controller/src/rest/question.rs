@@ -55,8 +55,10 @@ pub(super) fn usage(call: &Call) -> Answer {
 /// GET …/tasks/NAME/why: every node's reason, not only those that fit into the status.
 pub(super) async fn why(call: Call, target: Object) -> Answer {
     let key = target.key()?;
-    let stored = call.context.store.get(&key).ok_or_else(|| Failure::not_found(target.entry, &key.name))?;
-    let task: Task = objects::read(&stored).ok_or_else(|| Failure::internal("the task does not read as one"))?;
+    let stored =
+        call.context.store.get(&key).ok_or_else(|| Failure::not_found(target.entry, &key.name))?;
+    let task: Task =
+        objects::read(&stored).ok_or_else(|| Failure::internal("the task does not read as one"))?;
     let status = task.status.unwrap_or_default();
     let why = if status.phase == TaskPhase::Pending {
         let scheduler = live(&call.context)?.scheduler.clone();
@@ -79,7 +81,8 @@ pub(super) async fn plan(call: Call) -> Answer {
     let (parts, body) = request.into_parts();
     let body = body::json(&parts.headers, body).await?;
     let objects = body.get("objects").and_then(Value::as_array);
-    let objects = objects.ok_or_else(|| Failure::bad_request("the body must be {\"objects\": […]}"))?;
+    let objects =
+        objects.ok_or_else(|| Failure::bad_request("the body must be {\"objects\": […]}"))?;
     let revision = context.store.revision();
     let (mut changes, mut demands) = (Vec::new(), Vec::new());
     for (i, object) in objects.iter().enumerate() {
@@ -111,7 +114,8 @@ fn refused(index: usize, violations: Violations) -> Failure {
 fn change_of(context: &Context, object: &Value) -> Result<Value, Failure> {
     let text = |pointer: &str| object.pointer(pointer).and_then(Value::as_str);
     let kind = text("/kind").unwrap_or_default();
-    let name = text("/metadata/name").ok_or_else(|| Failure::bad_request("a planned object needs metadata.name"))?;
+    let name = text("/metadata/name")
+        .ok_or_else(|| Failure::bad_request("a planned object needs metadata.name"))?;
     let info = muster_api::kind::find(text("/apiVersion").unwrap_or_default(), kind)
         .expect("admission found the kind before");
     let entry = registry::find(info.group, info.plural)
@@ -119,7 +123,8 @@ fn change_of(context: &Context, object: &Value) -> Result<Value, Failure> {
     let namespace = info.namespaced.then(|| text("/metadata/namespace").unwrap_or(DEFAULT));
     let present = context.store.get(&entry.key(namespace, name)).map(|s| s.value());
     let same = |present: &Value| {
-        let labels = |o: &Value| o.pointer("/metadata/labels").cloned().unwrap_or(json!({}));
+        let labels =
+            |o: &Value| o.pointer("/metadata/labels").cloned().unwrap_or_else(|| json!({}));
         present["spec"] == object["spec"] && labels(present) == labels(object)
     };
     let action = match &present {
@@ -145,7 +150,8 @@ fn demand(index: usize, object: &Value, revision: u64) -> Result<Demand, Failure
 
 fn describe(names: &[(TaskUid, Value)], plan: &Plan, changes: Vec<Value>, revision: u64) -> Value {
     let with_name = |uid: &TaskUid, fields: Value| {
-        let mut named = names.iter().find(|(u, _)| u == uid).map_or_else(|| json!({}), |(_, n)| n.clone());
+        let mut named =
+            names.iter().find(|(u, _)| u == uid).map_or_else(|| json!({}), |(_, n)| n.clone());
         if let (Some(named), Value::Object(fields)) = (named.as_object_mut(), fields) {
             named.extend(fields);
         }
@@ -155,11 +161,18 @@ fn describe(names: &[(TaskUid, Value)], plan: &Plan, changes: Vec<Value>, revisi
         .binds
         .iter()
         .map(|bind| {
-            let leases: Vec<Value> =
-                bind.leases.iter().map(|(group, epoch)| json!({ "group": group, "epoch": epoch })).collect();
-            with_name(&bind.uid, json!({ "node": bind.node.as_str(), "score": bind.score, "leases": leases }))
+            let leases: Vec<Value> = bind
+                .leases
+                .iter()
+                .map(|(group, epoch)| json!({ "group": group, "epoch": epoch }))
+                .collect();
+            with_name(
+                &bind.uid,
+                json!({ "node": bind.node.as_str(), "score": bind.score, "leases": leases }),
+            )
         })
         .collect();
-    let waits: Vec<Value> = plan.waits.iter().map(|wait| with_name(&wait.uid, json!({ "why": wait.why }))).collect();
+    let waits: Vec<Value> =
+        plan.waits.iter().map(|wait| with_name(&wait.uid, json!({ "why": wait.why }))).collect();
     json!({ "changes": changes, "placements": placements, "waits": waits, "revision": revision.to_string() })
 }

@@ -244,3 +244,83 @@ fn random<const N: usize>() -> Result<[u8; N], Failure> {
         .map_err(|_| Failure::internal("the system has no randomness to give"))?;
     Ok(bytes)
 }
+
+#[cfg(test)]
+mod tests {
+    use std::sync::{Arc, Mutex};
+
+    use super::*;
+    use crate::config::Config;
+    use crate::context::Clock;
+    use crate::events::Recorder;
+    use crate::pki::Pki;
+
+    /// A clock that the test moves.
+    #[derive(Debug)]
+    struct Hand(Mutex<Timestamp>);
+
+    impl Clock for Hand {
+        fn now(&self) -> Timestamp {
+            *self.0.lock().unwrap()
+        }
+    }
+
+    async fn context(dir: &tempfile::TempDir) -> (Context, Arc<Hand>) {
+        let clock = Arc::new(Hand(Mutex::new("2026-11-22T12:00:00Z".parse().unwrap())));
+        let pki = Pki::open(dir.path(), clock.now()).unwrap();
+        let config = Config {
+            data_dir: dir.path().to_owned(),
+            listen: "127.0.0.1:0".parse().unwrap(),
+            kubeconfig: dir.path().join("kubeconfig"),
+            advertise: Vec::new(),
+        };
+        let (store, address) = (crate::store::memory::start().await, config.listen);
+        let (events, _) = Recorder::new();
+        let metrics = crate::metrics::recorder().unwrap();
+        let mut context = Context::new(store, pki, config, address, metrics, events);
+        context.clock = Arc::clone(&clock) as Arc<dyn Clock>;
+        (context, clock)
+    }
+
+    #[tokio::test]
+    async fn a_token_ends_when_it_says() {
+        let dir = tempfile::tempdir().unwrap();
+        let (context, clock) = context(&dir).await;
+        let spec = TokenSpec { ttl_seconds: Some(60), ..TokenSpec::default() };
+        let made = make(&context, spec).await.unwrap();
+        spend(&context, &made.token, "a").await.unwrap();
+        *clock.0.lock().unwrap() += SignedDuration::from_secs(59);
+        spend(&context, &made.token, "b").await.unwrap();
+        *clock.0.lock().unwrap() += SignedDuration::from_secs(1);
+        let refused = spend(&context, &made.token, "c").await.unwrap_err();
+        assert_eq!(refused.code(), 401);
+        assert!(refused.message().contains("expired at 2026-11-22T12:01:00Z"), "{refused:?}");
+    }
+
+    #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+    async fn a_token_for_one_use_is_used_once_however_many_try() {
+        let dir = tempfile::tempdir().unwrap();
+        let (context, _) = context(&dir).await;
+        let spec = TokenSpec { uses: Some(1), ..TokenSpec::default() };
+        let made = make(&context, spec).await.unwrap();
+        let tries = (0..8).map(|n| {
+            let (context, token) = (&context, made.token.as_str());
+            async move { spend(context, token, &format!("n{n}")).await }
+        });
+        let outcomes = futures::future::join_all(tries).await;
+        assert_eq!(outcomes.iter().filter(|outcome| outcome.is_ok()).count(), 1);
+    }
+
+    #[tokio::test]
+    async fn specs_that_make_no_sense_are_refused() {
+        let dir = tempfile::tempdir().unwrap();
+        let (context, _) = context(&dir).await;
+        for spec in [
+            TokenSpec { ttl_seconds: Some(0), ..TokenSpec::default() },
+            TokenSpec { ttl_seconds: Some(MAX_TTL + 1), ..TokenSpec::default() },
+            TokenSpec { uses: Some(0), ..TokenSpec::default() },
+        ] {
+            assert_eq!(make(&context, spec).await.unwrap_err().code(), 400);
+        }
+    }
+}

@@ -4,12 +4,17 @@ use std::sync::Arc;
 
 use http::{HeaderValue, StatusCode};
 use muster_api::kind;
+use muster_api::kind::namespace::Namespace;
+use muster_api::kind::node::Node;
+use muster_api::kind::task::Task;
 use muster_api::validate::Violations;
+use serde::Deserialize as _;
 use serde_json::Value;
 
 use super::create::with_warnings;
 use super::path::{Object, Subresource};
 use super::query::FieldValidation;
+use super::registry::Entry;
 use super::{Answer, Call, admission, body, failure::Failure, metadata};
 use crate::context::Context;
 use crate::store::{Op, Precondition, Store, StoreError, Stored};
@@ -114,11 +119,7 @@ fn next(
             (None, Some(fields)) => drop(fields.remove("status")),
             (_, None) => {}
         }
-        if object.get("status").is_some_and(|status| !status.is_object() && !status.is_null()) {
-            let mut violations = Violations::new();
-            violations.invalid("status", "is not an object");
-            return Err(Failure::invalid(entry, name, &violations));
-        }
+        check_status(entry, name, &object)?;
         return Ok(Next { object, warnings: Vec::new(), pinned });
     }
     let Some(own) = metadata::of(&mut new) else {
@@ -139,6 +140,22 @@ fn next(
     check_finalizers(entry, name, &old, &admitted.object)?;
     metadata::count(&old, &mut admitted.object);
     Ok(Next { object: admitted.object, warnings: admitted.warnings, pinned })
+}
+
+/// Refuses a status that does not read as its kind: everything that works on the object would have to leave it alone
+/// from then on.
+fn check_status(entry: &Entry, name: &str, object: &Value) -> Result<(), Failure> {
+    let read = match entry.info.kind {
+        "Task" => Task::deserialize(object).map(drop),
+        "Node" => Node::deserialize(object).map(drop),
+        "Namespace" => Namespace::deserialize(object).map(drop),
+        _ => Ok(()),
+    };
+    read.map_err(|error| {
+        let mut violations = Violations::new();
+        violations.invalid("status", error.to_string());
+        Failure::invalid(entry, name, &violations)
+    })
 }
 
 /// Holds what the client says about the object's identity against the object. Returns whether it named a version.
@@ -181,12 +198,7 @@ fn check_identity(target: &Object, present: &Stored, new: &Value) -> Result<bool
 }
 
 /// Nobody may ask to be waited for by an object that is already ending.
-fn check_finalizers(
-    entry: &super::registry::Entry,
-    name: &str,
-    old: &Value,
-    new: &Value,
-) -> Result<(), Failure> {
+fn check_finalizers(entry: &Entry, name: &str, old: &Value, new: &Value) -> Result<(), Failure> {
     if !metadata::is_ending(old) {
         return Ok(());
     }

@@ -65,7 +65,8 @@ type Outbound = mpsc::Sender<Result<wire::ControllerMessage, Status>>;
 
 #[tonic::async_trait]
 impl AgentService for Agents {
-    type SessionStream = Pin<Box<dyn Stream<Item = Result<wire::ControllerMessage, Status>> + Send>>;
+    type SessionStream =
+        Pin<Box<dyn Stream<Item = Result<wire::ControllerMessage, Status>> + Send>>;
 
     async fn session(
         &self,
@@ -75,7 +76,8 @@ impl AgentService for Agents {
             Some(Identity::Node { name }) => name.clone(),
             _ => return Err(Status::unauthenticated("a node's client certificate is needed")),
         };
-        let node = NodeName::new(node).map_err(|e| Status::unauthenticated(format!("the certificate's name {e}")))?;
+        let node = NodeName::new(node)
+            .map_err(|e| Status::unauthenticated(format!("the certificate's name {e}")))?;
         let (to_agent, outbound) = mpsc::channel(OUTBOUND);
         let session = Session {
             context: Arc::clone(&self.context),
@@ -132,7 +134,9 @@ impl Session {
 
     async fn serve(&mut self) -> Result<std::convert::Infallible, End> {
         let hello = tokio::time::timeout(HELLO_WITHIN, self.next()).await;
-        let Ok(FromAgent::Hello(hello)) = hello.map_err(|_| Status::deadline_exceeded("no Hello came"))? else {
+        let Ok(FromAgent::Hello(hello)) =
+            hello.map_err(|_| Status::deadline_exceeded("no Hello came"))?
+        else {
             return Err(Status::invalid_argument("the first message of a session is Hello").into());
         };
         let speaker = self.speaker(&hello)?;
@@ -140,7 +144,12 @@ impl Session {
         let (outbound, mut relayed) = mpsc::channel(OUTBOUND);
         let replaced = CancellationToken::new();
         let logs = Arc::default();
-        let connection = Connection { id: self.id, outbound, logs: Arc::clone(&logs), replaced: replaced.clone() };
+        let connection = Connection {
+            id: self.id,
+            outbound,
+            logs: Arc::clone(&logs),
+            replaced: replaced.clone(),
+        };
         self.sessions.connect(&self.node, connection);
         self.take_node(&speaker, hello.state.as_ref()).await?;
         self.sessions.heard(&self.node);
@@ -159,7 +168,11 @@ impl Session {
             self.acknowledge(report).await?;
         }
         tracing::info!(node = %self.node, incarnation = %speaker.incarnation, tasks = hello.tasks.len(), "agent connected");
-        self.context.events.node(self.node.as_str(), "AgentConnected", format!("agent {} is connected", speaker.version));
+        self.context.events.node(
+            self.node.as_str(),
+            "AgentConnected",
+            format!("agent {} is connected", speaker.version),
+        );
         self.listen(&speaker, &wake, &mut relayed, &logs, &replaced).await
     }
 
@@ -194,7 +207,8 @@ impl Session {
 
     fn speaker(&self, hello: &wire::Hello) -> Result<Speaker, Status> {
         if hello.node != self.node.as_str() {
-            let text = format!("the certificate is {}'s, and Hello says {:?}", self.node, hello.node);
+            let text =
+                format!("the certificate is {}'s, and Hello says {:?}", self.node, hello.node);
             return Err(Status::permission_denied(text));
         }
         if hello.incarnation.is_empty() {
@@ -268,17 +282,28 @@ impl Session {
     }
 
     async fn apply_report(&self, report: &wire::TaskReport) -> Result<(), End> {
-        reports::apply(&self.context, &self.sessions, &self.node, report).await.map_err(|error| match error {
-            reports::ReportError::Wire(wire) => End::Because(Status::invalid_argument(wire.to_string())),
-            reports::ReportError::Store(store) => internal(store),
+        reports::apply(&self.context, &self.sessions, &self.node, report).await.map_err(|error| {
+            match error {
+                reports::ReportError::Wire(wire) => {
+                    End::Because(Status::invalid_argument(wire.to_string()))
+                }
+                reports::ReportError::Store(store) => internal(store),
+            }
         })
     }
 
-    async fn take_node(&self, speaker: &Speaker, state: Option<&wire::NodeState>) -> Result<(), End> {
+    async fn take_node(
+        &self,
+        speaker: &Speaker,
+        state: Option<&wire::NodeState>,
+    ) -> Result<(), End> {
         let state = state.ok_or_else(|| Status::invalid_argument("hello.state is missing"))?;
-        let report = NodeReport::try_from(state).map_err(|e| Status::invalid_argument(e.to_string()))?;
+        let report =
+            NodeReport::try_from(state).map_err(|e| Status::invalid_argument(e.to_string()))?;
         nodes::write(&self.context, speaker, &report).await.map_err(|error| match error {
-            nodes::NodeError::KindChanged { .. } => End::Because(Status::failed_precondition(error.to_string())),
+            nodes::NodeError::KindChanged { .. } => {
+                End::Because(Status::failed_precondition(error.to_string()))
+            }
             nodes::NodeError::Store(store) => internal(store),
         })
     }

@@ -78,7 +78,10 @@ impl Board {
         let page = pages.by_node.entry(node.clone()).or_default();
         page.changed.clear();
         let upserts = page.assignments.values().cloned().collect();
-        (wire::Assignments { complete: true, upserts, released: Vec::new() }, Arc::clone(&page.wake))
+        (
+            wire::Assignments { complete: true, upserts, released: Vec::new() },
+            Arc::clone(&page.wake),
+        )
     }
 
     /// What changed for a node since the last call; none: nothing.
@@ -128,8 +131,12 @@ impl Board {
     /// Takes off what the store does not have any more.
     fn keep_only(&self, uids: &BTreeSet<TaskUid>) {
         let mut pages = lock(&self.pages);
-        let gone: Vec<(TaskUid, NodeName)> =
-            pages.tasks.iter().filter(|(u, _)| !uids.contains(*u)).map(|(u, (n, _))| (u.clone(), n.clone())).collect();
+        let gone: Vec<(TaskUid, NodeName)> = pages
+            .tasks
+            .iter()
+            .filter(|(u, _)| !uids.contains(*u))
+            .map(|(u, (n, _))| (u.clone(), n.clone()))
+            .collect();
         for (uid, node) in gone {
             pages.tasks.remove(&uid);
             let page = pages.by_node.entry(node).or_default();
@@ -145,10 +152,11 @@ impl Board {
 /// What the agent of its node gets of a placed task.
 fn assignment(task: &Task) -> wire::Assignment {
     let status = task.status.clone().unwrap_or_default();
-    let stop = task.metadata.deletion_timestamp.is_some().then(|| wire::Stop {
-        grace_period_ms: grace_ms(task),
-        reason: "Deleted".to_owned(),
-    });
+    let stop = task
+        .metadata
+        .deletion_timestamp
+        .is_some()
+        .then(|| wire::Stop { grace_period_ms: grace_ms(task), reason: "Deleted".to_owned() });
     wire::Assignment {
         uid: objects::uid_of(&task.metadata).to_owned(),
         namespace: task.metadata.namespace.clone().unwrap_or_default(),
@@ -162,7 +170,8 @@ fn assignment(task: &Task) -> wire::Assignment {
 
 fn grace_ms(task: &Task) -> u32 {
     let seconds = task.metadata.deletion_grace_period_seconds;
-    let seconds = seconds.and_then(|s| u32::try_from(s).ok()).unwrap_or(task.spec.grace_period_seconds);
+    let seconds =
+        seconds.and_then(|s| u32::try_from(s).ok()).unwrap_or(task.spec.grace_period_seconds);
     seconds.saturating_mul(1000)
 }
 

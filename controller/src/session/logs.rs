@@ -86,25 +86,42 @@ pub(crate) struct SessionLogs {
 }
 
 impl LogSource for SessionLogs {
-    fn open(&self, task: Key, options: LogOptions) -> BoxFuture<'_, Result<BoxStream<'static, Chunk>, LogError>> {
+    fn open(
+        &self,
+        task: Key,
+        options: LogOptions,
+    ) -> BoxFuture<'_, Result<BoxStream<'static, Chunk>, LogError>> {
         Box::pin(self.open_log(task, options))
     }
 }
 
 impl SessionLogs {
-    async fn open_log(&self, key: Key, options: LogOptions) -> Result<BoxStream<'static, Chunk>, LogError> {
+    async fn open_log(
+        &self,
+        key: Key,
+        options: LogOptions,
+    ) -> Result<BoxStream<'static, Chunk>, LogError> {
         let ends = || LogError::Broken("the controller ends".to_owned());
         let context = self.context.upgrade().ok_or_else(ends)?;
-        let stored = context.store.get(&key).ok_or_else(|| LogError::Nothing("the task is gone".to_owned()))?;
-        let task: Task = objects::read(&stored).ok_or_else(|| LogError::Nothing("the task cannot be read".to_owned()))?;
+        let stored = context
+            .store
+            .get(&key)
+            .ok_or_else(|| LogError::Nothing("the task is gone".to_owned()))?;
+        let task: Task = objects::read(&stored)
+            .ok_or_else(|| LogError::Nothing("the task cannot be read".to_owned()))?;
         let node = task.status.and_then(|s| s.node);
-        let node = node.ok_or_else(|| LogError::Nothing("the task has not been placed yet".to_owned()))?;
+        let node =
+            node.ok_or_else(|| LogError::Nothing("the task has not been placed yet".to_owned()))?;
         let unreachable = || LogError::Unreachable { node: node.clone() };
         let name = NodeName::new(node.clone()).map_err(|_| unreachable())?;
         let connection = self.sessions.connection(&name).ok_or_else(unreachable)?;
         let (id, receiver) = connection.logs.begin();
         let since = options.since_seconds.and_then(|s| {
-            let since = context.clock.now().checked_sub(SignedDuration::from_secs(i64::try_from(s).ok()?)).ok()?;
+            let since = context
+                .clock
+                .now()
+                .checked_sub(SignedDuration::from_secs(i64::try_from(s).ok()?))
+                .ok()?;
             Some(prost_time(since))
         });
         let request = wire::LogRequest {
@@ -116,7 +133,8 @@ impl SessionLogs {
             timestamps: options.timestamps,
             since,
         };
-        let message = wire::ControllerMessage { body: Some(wire::controller_message::Body::Log(request)) };
+        let message =
+            wire::ControllerMessage { body: Some(wire::controller_message::Body::Log(request)) };
         let reading = Reading { connection: connection.clone(), id };
         connection.outbound.send(message).await.map_err(|_| unreachable())?;
         let chunks = stream::unfold((receiver, reading), |(mut receiver, reading)| async move {

@@ -41,7 +41,11 @@ pub(crate) enum NodeError {
 }
 
 /// Writes what an agent says of its node; creates the Node when it is new. Ready becomes true.
-pub(crate) async fn write(context: &Context, speaker: &Speaker, report: &NodeReport) -> Result<(), NodeError> {
+pub(crate) async fn write(
+    context: &Context,
+    speaker: &Speaker,
+    report: &NodeReport,
+) -> Result<(), NodeError> {
     let key = objects::node_key(speaker.node.as_str());
     loop {
         let Some(stored) = context.store.get(&key) else {
@@ -75,7 +79,12 @@ pub(crate) async fn write(context: &Context, speaker: &Speaker, report: &NodeRep
 }
 
 fn create(context: &Context, speaker: &Speaker, report: &NodeReport) -> Vec<Op> {
-    let spec = NodeSpec { kind: report.kind, unschedulable: false, taints: Vec::new(), speed: report.speed };
+    let spec = NodeSpec {
+        kind: report.kind,
+        unschedulable: false,
+        taints: Vec::new(),
+        speed: report.speed,
+    };
     let mut node = Node::new(speaker.node.as_str(), spec);
     objects::stamp_new(&mut node.metadata, context.clock.now());
     fill(context, speaker, report, &mut node);
@@ -164,15 +173,23 @@ fn is_new_place(old: &Pose, new: &Pose) -> bool {
 }
 
 /// Writes a moved robot's pose down, when it moved a step.
-pub(crate) async fn write_pose(context: &Context, node: &NodeName, pose: &Pose) -> Result<(), StoreError> {
-    objects::change(&context.store, &objects::node_key(node.as_str()), |stored, mut object: Node| {
-        let status = object.status.get_or_insert_default();
-        if status.pose.as_ref().is_some_and(|old| !is_new_place(old, pose)) {
-            return None;
-        }
-        status.pose = Some(pose.clone());
-        Some(vec![objects::replace(stored, &object)])
-    })
+pub(crate) async fn write_pose(
+    context: &Context,
+    node: &NodeName,
+    pose: &Pose,
+) -> Result<(), StoreError> {
+    objects::change(
+        &context.store,
+        &objects::node_key(node.as_str()),
+        |stored, mut object: Node| {
+            let status = object.status.get_or_insert_default();
+            if status.pose.as_ref().is_some_and(|old| !is_new_place(old, pose)) {
+                return None;
+            }
+            status.pose = Some(pose.clone());
+            Some(vec![objects::replace(stored, &object)])
+        },
+    )
     .await
     .map(drop)
 }

@@ -35,8 +35,16 @@ pub(crate) async fn apply(
     report: &wire::TaskReport,
 ) -> Result<(), ReportError> {
     let phase = phase_from_wire(report.phase)?;
-    let started = report.started_at.as_ref().map(|t| timestamp_from_wire("task.started_at", t)).transpose()?;
-    let finished = report.finished_at.as_ref().map(|t| timestamp_from_wire("task.finished_at", t)).transpose()?;
+    let started = report
+        .started_at
+        .as_ref()
+        .map(|t| timestamp_from_wire("task.started_at", t))
+        .transpose()?;
+    let finished = report
+        .finished_at
+        .as_ref()
+        .map(|t| timestamp_from_wire("task.finished_at", t))
+        .transpose()?;
     let Some((placed_on, key)) = sessions.board().find(&report.uid) else { return Ok(()) };
     if placed_on != *node {
         tracing::warn!(uid = report.uid, %node, %placed_on, "a report about another node's task is ignored");
@@ -61,7 +69,9 @@ pub(crate) async fn apply(
         status.report_sequence = report.sequence;
         let lease = status.lease.clone().filter(|_| phase.is_terminal());
         let mut ops = vec![objects::replace(stored, &task)];
-        ops.extend(lease.and_then(|l| objects::release_lease(&context.store, &l.name, &stored.uid)));
+        ops.extend(
+            lease.and_then(|l| objects::release_lease(&context.store, &l.name, &stored.uid)),
+        );
         told = Some((before, task));
         Some(ops)
     })
@@ -83,21 +93,33 @@ fn is_news(status: &TaskStatus, phase: TaskPhase, sequence: u64) -> bool {
 /// Puts what a person should see into an Event.
 fn tell(context: &Context, before: TaskPhase, task: &Task) {
     let Some(status) = &task.status else { return };
-    let message = if status.message.is_empty() { format!("{}", status.phase) } else { status.message.clone() };
+    let message = if status.message.is_empty() {
+        format!("{}", status.phase)
+    } else {
+        status.message.clone()
+    };
     match status.phase {
         TaskPhase::Running if before != TaskPhase::Running => {
             context.events.task(task, "Started", format!("attempt {} runs", status.attempt));
         }
         TaskPhase::Succeeded => context.events.task(task, "Completed", message),
-        TaskPhase::Failed => context.events.warn_task(task, "Failed", format!("{}: {message}", status.reason)),
-        TaskPhase::Starting if status.attempt > 1 => context.events.warn_task(task, "Restarting", message),
+        TaskPhase::Failed => {
+            context.events.warn_task(task, "Failed", format!("{}: {message}", status.reason))
+        }
+        TaskPhase::Starting if status.attempt > 1 => {
+            context.events.warn_task(task, "Restarting", message)
+        }
         _ => {}
     }
 }
 
 /// After a session began: tasks that were lost with the node and of which the agent said nothing are
 /// placed and not started yet.
-pub(crate) async fn unsaid(context: &Context, sessions: &Sessions, node: &NodeName) -> Result<(), StoreError> {
+pub(crate) async fn unsaid(
+    context: &Context,
+    sessions: &Sessions,
+    node: &NodeName,
+) -> Result<(), StoreError> {
     for key in sessions.board().tasks_on(node) {
         objects::change(&context.store, &key, |stored, mut task: Task| {
             let status = task.status.get_or_insert_default();
@@ -106,7 +128,8 @@ pub(crate) async fn unsaid(context: &Context, sessions: &Sessions, node: &NodeNa
             }
             status.phase = TaskPhase::Bound;
             status.reason = "NodeReturned".to_owned();
-            status.message = "the node is back and has not said anything of the task yet".to_owned();
+            status.message =
+                "the node is back and has not said anything of the task yet".to_owned();
             Some(vec![objects::replace(stored, &task)])
         })
         .await?;
@@ -128,7 +151,10 @@ mod tests {
         assert!(is_news(&status(Running, 3), Running, 4));
         assert!(!is_news(&status(Running, 3), Running, 3));
         assert!(!is_news(&status(Running, 3), Running, 2));
-        assert!(is_news(&status(Unknown, 3), Running, 3), "a node that comes back says the same again");
+        assert!(
+            is_news(&status(Unknown, 3), Running, 3),
+            "a node that comes back says the same again"
+        );
         assert!(!is_news(&status(Succeeded, 3), Failed, 9), "an end stays");
     }
 }

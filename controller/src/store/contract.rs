@@ -263,6 +263,21 @@ async fn a_failed_commit_leaves_no_trace() {
 }
 
 #[tokio::test]
+async fn a_commit_that_only_seemed_to_fail_is_published_late() {
+    let (store, writer, failures) = memory::open().await;
+    let running = Running::new((store.clone(), writer));
+    failures.mislead_next(1);
+    let unsure = store.create(task("a"), body("a", 0)).await;
+    assert!(matches!(unsure, Err(StoreError::Storage { .. })), "{unsure:?}");
+    assert_eq!(store.get(&task("a")), None, "not before the disk was asked");
+    let again = store.create(task("a"), body("a", 0)).await;
+    assert!(matches!(again, Err(StoreError::AlreadyExists { .. })), "{again:?}");
+    assert_eq!(create(&store, "b").await.revision, 2);
+    assert_eq!(store.watch(TASKS, 0).unwrap().take().unwrap().len(), 2);
+    running.shut_down().await;
+}
+
+#[tokio::test]
 async fn a_row_that_sqlite_refuses_fails_its_whole_batch() {
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join("db");
@@ -455,4 +470,35 @@ async fn throughput() {
         println!("{writers} writers: {rate:.0} durable writes/s of 1.4 kB");
     }
     running.shut_down().await;
+}
+
+/// Not a test of size: prints what the objects of a large site take. Run like `throughput`.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+#[ignore = "a measurement"]
+async fn memory_of_a_large_site() {
+    let resident = || {
+        let status = std::fs::read_to_string("/proc/self/status").unwrap();
+        let line = status.lines().find(|line| line.starts_with("VmRSS")).unwrap();
+        line.split_whitespace().nth(1).unwrap().parse::<u64>().unwrap() / 1024
+    };
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("db");
+    let running = Running::sqlite(&path).await;
+    let before = resident();
+    let padding = "x".repeat(1700);
+    for chunk in (0..16_000_u64).collect::<Vec<_>>().chunks(500) {
+        let op = |n: &u64| {
+            let name = format!("object-{n}");
+            let mut value = body(&name, *n);
+            value["spec"]["padding"] = padding.clone().into();
+            let key = if *n < 10_000 { Key::cluster(NODES, name) } else { task(&name) };
+            Op::create(key, value)
+        };
+        running.store.apply(chunk.iter().map(op).collect()).await.unwrap();
+    }
+    println!("{before} MiB before, {} MiB with 16 000 objects of 1.8 kB", resident());
+    running.shut_down().await;
+    let again = Running::sqlite(&path).await;
+    println!("{} MiB after a second start in the same process", resident());
+    again.shut_down().await;
 }

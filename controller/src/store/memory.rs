@@ -13,12 +13,20 @@ use super::{Store, Writer, writer};
 
 /// Makes coming commits fail.
 #[derive(Debug, Clone, Default)]
-pub struct Failures(Arc<AtomicU32>);
+pub struct Failures {
+    lost: Arc<AtomicU32>,
+    unheard: Arc<AtomicU32>,
+}
 
 impl Failures {
     /// The next `commits` fail; nothing of them is kept.
     pub fn fail_next(&self, commits: u32) {
-        self.0.store(commits, Ordering::SeqCst);
+        self.lost.store(commits, Ordering::SeqCst);
+    }
+
+    /// The next `commits` take effect, and are reported as failed.
+    pub fn mislead_next(&self, commits: u32) {
+        self.unheard.store(commits, Ordering::SeqCst);
     }
 }
 
@@ -37,17 +45,15 @@ impl Backend for Memory {
     }
 
     fn commit<'a>(&'a mut self, batch: Batch<'a>) -> BoxFuture<'a, Result<(), BackendError>> {
-        let failing = self
-            .failures
-            .0
-            .fetch_update(Ordering::SeqCst, Ordering::SeqCst, |left| left.checked_sub(1));
-        let result = match failing {
-            Ok(_) => Err(BackendError::Injected),
-            Err(_) => {
-                self.last = batch.events.last().map_or(self.last, super::Event::revision);
-                Ok(())
-            }
+        let take = |left: &AtomicU32| {
+            left.fetch_update(Ordering::SeqCst, Ordering::SeqCst, |left| left.checked_sub(1))
         };
+        let lost = take(&self.failures.lost).is_ok();
+        if !lost {
+            self.last = batch.events.last().map_or(self.last, super::Event::revision);
+        }
+        let failed = lost || take(&self.failures.unheard).is_ok();
+        let result = if failed { Err(BackendError::Injected) } else { Ok(()) };
         async { result }.boxed()
     }
 

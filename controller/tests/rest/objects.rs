@@ -38,6 +38,9 @@ async fn a_task_lives_through_the_kube_client() {
     let with_status = tasks.patch_status("scan", &PatchParams::default(), &patch).await.unwrap();
     assert_eq!(with_status.status.unwrap().node.as_deref(), Some("n1"));
     assert_eq!(with_status.spec.priority, 5, "status writes status only");
+    let nonsense = Patch::Merge(json!({"status": {"phase": "Dancing"}}));
+    let refused = tasks.patch_status("scan", &PatchParams::default(), &nonsense).await.unwrap_err();
+    assert!(matches!(refused, kube::Error::Api(ref s) if s.code == 422), "{refused}");
     let found = tasks.list(&ListParams::default().labels("tier=a")).await.unwrap();
     assert_eq!(found.items.len(), 1);
     cluster.running.shut_down().await.unwrap();
@@ -180,6 +183,7 @@ async fn lists_select_and_come_in_exact_pages() {
     let unknown = select("fieldSelector=spec.unknown=1").await;
     assert_eq!(refusal(&unknown), (400, "BadRequest"));
     assert_eq!(refusal(&select("continue=nonsense").await), (400, "BadRequest"));
+    assert_eq!(refusal(&select("resourceVersion=99999").await), (504, "Timeout"));
     cluster.running.shut_down().await.unwrap();
 }
 

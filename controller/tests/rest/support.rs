@@ -41,7 +41,11 @@ impl Cluster {
         // Only the first caller of a process installs it, and any of them is as good.
         drop(rustls::crypto::ring::default_provider().install_default());
         let file = Kubeconfig::read_from(self.kubeconfig()).unwrap();
-        kube::Config::from_custom_kubeconfig(file, &KubeConfigOptions::default()).await.unwrap()
+        let options = KubeConfigOptions::default();
+        let mut config = kube::Config::from_custom_kubeconfig(file, &options).await.unwrap();
+        // Refusals are what these tests are after.
+        config.default_retry = false;
+        config
     }
 
     pub(crate) async fn admin(&self) -> Client {

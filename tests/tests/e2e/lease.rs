@@ -24,12 +24,18 @@ async fn a_holder_that_ignores_sigterm_keeps_the_lease_until_it_is_killed() {
     assert!(kernel::with_env("MUSTER_UID", &uid).len() >= 2, "the task and its child run");
 
     cluster.create("next", driver("sleep 1000", 0)).await;
-    cluster.task("next", "waiting for the lease", |s| s.why.iter().any(|w| w.reason == "LeaseHeld")).await;
+    cluster
+        .task("next", "waiting for the lease", |s| s.why.iter().any(|w| w.reason == "LeaseHeld"))
+        .await;
     cluster.tasks().await.delete("holder", &Default::default()).await.expect("it is there");
 
     // Whenever the next one has the lease, nothing of the holder is left.
     let next = cluster.task("next", "bound", |s| s.phase != TaskPhase::Pending).await;
-    assert_eq!(kernel::with_env("MUSTER_UID", &uid), [], "the lease passed while its old holder ran");
+    assert_eq!(
+        kernel::with_env("MUSTER_UID", &uid),
+        [],
+        "the lease passed while its old holder ran"
+    );
     assert_eq!(next.status.and_then(|s| s.lease).map(|l| l.epoch.0), Some(2));
     cluster.phase("next", TaskPhase::Running).await;
 }

@@ -1,34 +1,52 @@
 //! Quotas are real: measured in the kernel's own accounts, for both runtimes.
+//!
+//! [`process`] also runs in a guest with cgroup v2 (see tests/guest).
 
 use std::time::{Duration, Instant};
 
+use muster_api::kind::task::TaskStatus;
 use muster_api::phase::TaskPhase;
 use muster_tests::{AgentOptions, Cluster, kernel, wait};
 use serde_json::{Value, json};
 
 const SPIN: [&str; 3] = ["sh", "-c", "while :; do :; done"];
+/// Doubles a text until the kernel ends it; 200 MiB are passed on the way.
+const HOARD: [&str; 2] = ["awk", "BEGIN { s = \"x\"; while (1) s = s s }"];
 
-fn process(cpu: &str, command: &[&str]) -> Value {
+async fn cloud() -> Cluster {
+    let mut cluster = Cluster::start().await;
+    cluster.join(AgentOptions::cloud("cloud")).await;
+    cluster
+}
+
+fn task(run: Value) -> Value {
     json!({
-        "resources": {"cpu": cpu, "memory": "64Mi"},
-        "run": {"process": {"command": command}},
+        "resources": {"cpu": "500m", "memory": "64Mi"},
+        "run": run,
         "gracePeriodSeconds": 0,
     })
 }
 
-/// Cores that a task gets, over a span that the kernel's counters define.
+/// Cores that a running task gets, from the kernel's account of its cgroup.
 async fn share(cluster: &Cluster, name: &str) -> f64 {
     let task = cluster.phase(name, TaskPhase::Running).await;
     let uid = task.metadata.uid.expect("set by the server");
     let pid = wait::until("visible in /proc", || async {
-        kernel::with_env("MUSTER_UID", &uid).first().map(|p| p.pid).ok_or_else(|| "no process".to_owned())
+        kernel::with_env("MUSTER_UID", &uid)
+            .first()
+            .map(|p| p.pid)
+            .ok_or_else(|| "no process".to_owned())
     })
     .await;
     let read = || kernel::cgroup_cpu_time(pid).expect("a task is in a cgroup");
-    // Let the first period of the quota pass, so that a burst at the start does not count.
+    // Let some periods of the quota pass, so that the burst at the start does not count.
     let begin = read();
-    wait::until("running for a period", || async move {
-        if read() > begin + Duration::from_millis(100) { Ok(()) } else { Err("starting".to_owned()) }
+    wait::until("warm", || async move {
+        if read() > begin + Duration::from_millis(200) {
+            Ok(())
+        } else {
+            Err("starting".to_owned())
+        }
     })
     .await;
     let (cpu, wall) = (read(), Instant::now());
@@ -39,22 +57,93 @@ async fn share(cluster: &Cluster, name: &str) -> f64 {
     (read() - cpu).as_secs_f64() / wall.elapsed().as_secs_f64()
 }
 
-#[tokio::test(flavor = "multi_thread")]
-async fn a_process_that_spins_gets_its_quota_and_no_more() {
-    let mut cluster = Cluster::start().await;
-    cluster.join(AgentOptions::cloud("cloud")).await;
-    cluster.create("spin", process("500m", &SPIN)).await;
+async fn gets_half_a_core(run: Value) {
+    let cluster = cloud().await;
+    cluster.create("spin", task(run)).await;
     let share = share(&cluster, "spin").await;
     assert!((share - 0.5).abs() <= 0.03, "{share:.3} cores instead of 0.500");
+    cluster.delete("spin").await;
 }
 
-#[tokio::test(flavor = "multi_thread")]
-async fn a_process_over_its_memory_is_killed_and_says_so() {
-    let mut cluster = Cluster::start().await;
-    cluster.join(AgentOptions::cloud("cloud")).await;
-    // One line of 200 MiB, which `tail` must hold whole.
-    let hungry = "exec tail -n 1 <<EOF\n$(head -c 209715200 /dev/zero | tr '\\0' x)\nEOF";
-    cluster.create("hungry", process("1", &["sh", "-c", hungry])).await;
-    let status = cluster.phase("hungry", TaskPhase::Failed).await.status.expect("failed");
+async fn ends_as_oom_killed(run: Value) -> TaskStatus {
+    let cluster = cloud().await;
+    cluster.create("hoard", task(run)).await;
+    let status = cluster.phase("hoard", TaskPhase::Failed).await.status.expect("failed");
     assert_eq!((status.reason.as_str(), status.exit_code), ("OOMKilled", Some(137)), "{status:?}");
+    cluster.delete("hoard").await;
+    status
+}
+
+mod process {
+    use super::*;
+
+    fn run(command: &[&str]) -> Value {
+        json!({"process": {"command": command}})
+    }
+
+    #[tokio::test(flavor = "multi_thread")]
+    async fn a_spinning_process_gets_its_quota_and_no_more() {
+        gets_half_a_core(run(&SPIN)).await;
+    }
+
+    #[tokio::test(flavor = "multi_thread")]
+    async fn a_process_over_its_memory_is_killed_and_says_so() {
+        ends_as_oom_killed(run(&HOARD)).await;
+    }
+}
+
+mod container {
+    use muster_tests::docker;
+
+    use super::*;
+
+    fn run(command: &[&str]) -> Value {
+        docker::image();
+        json!({"container": {"image": docker::IMAGE, "command": command, "network": "None", "pullPolicy": "Never"}})
+    }
+
+    #[tokio::test(flavor = "multi_thread")]
+    async fn a_spinning_container_gets_its_quota_and_no_more() {
+        gets_half_a_core(run(&SPIN)).await;
+    }
+
+    #[tokio::test(flavor = "multi_thread")]
+    async fn a_container_over_its_memory_is_killed_and_says_so() {
+        ends_as_oom_killed(run(&HOARD)).await;
+    }
+
+    #[tokio::test(flavor = "multi_thread")]
+    async fn a_container_outlives_its_agent_and_tells_its_true_end() {
+        let mut cluster = cloud().await;
+        let until_told = json!({"container": {
+            "image": docker::IMAGE,
+            "command": ["sh", "-c", "until [ -e /told/now ]; do sleep 0.1; done; exit 7"],
+            "mounts": [{"hostPath": cluster.dir(), "mountPath": "/told"}],
+            "network": "None",
+        }});
+        docker::image();
+        let task = cluster.create("patient", task(until_told)).await;
+        let uid = task.metadata.uid.expect("set by the server");
+        cluster.phase("patient", TaskPhase::Running).await;
+        // Its first process; `sleep`s come and go beside it.
+        let main =
+            || kernel::with_env("MUSTER_UID", &uid).into_iter().min_by_key(|p| (p.start, p.pid));
+        let before = main();
+        assert!(before.is_some(), "it runs");
+        cluster.kill_agent("cloud");
+        cluster.restart_agent("cloud").await;
+        cluster.phase("patient", TaskPhase::Running).await;
+        assert_eq!(main(), before, "the container was touched");
+        cluster.kill_agent("cloud");
+        std::fs::write(cluster.dir().join("now"), "").expect("writable");
+        cluster.restart_agent("cloud").await;
+        let status = cluster.phase("patient", TaskPhase::Failed).await.status.expect("failed");
+        assert_eq!((status.exit_code, status.attempt), (Some(7), 1), "{status:?}");
+        cluster.delete("patient").await;
+        assert_eq!(
+            docker::containers_of(&uid),
+            Vec::<String>::new(),
+            "containers are removed with their task"
+        );
+    }
 }

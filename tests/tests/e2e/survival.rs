@@ -21,7 +21,9 @@ async fn twenty_tasks_outlive_kill_9_of_agent_and_controller() {
     // One that ends with its own code once it is told to, by a file.
     let gate = cluster.dir().join("end-now");
     let script = format!("until [ -e {} ]; do sleep 0.05; done; exit 42", gate.display());
-    let ends = cluster.create("ends", json!({"run": {"process": {"command": ["sh", "-c", script]}}})).await;
+    let ends = cluster
+        .create("ends", json!({"run": {"process": {"command": ["sh", "-c", script]}}}))
+        .await;
     let ends = ends.metadata.uid.expect("set by the server");
     let mut pids = BTreeMap::new();
     for (name, uid) in &before {
@@ -42,7 +44,8 @@ async fn twenty_tasks_outlive_kill_9_of_agent_and_controller() {
     cluster.start_controller().await;
     cluster.restart_agent("robot").await;
 
-    let status = cluster.task("ends", "told its end", |s| s.phase.is_terminal()).await.status.expect("set");
+    let status =
+        cluster.task("ends", "told its end", |s| s.phase.is_terminal()).await.status.expect("set");
     assert_eq!((status.phase, status.exit_code), (TaskPhase::Failed, Some(42)), "{status:?}");
     for (name, uid) in &before {
         let status = cluster.phase(name, TaskPhase::Running).await.status.expect("running");
