@@ -165,6 +165,18 @@ impl Cluster {
         kubeconfig.clusters[0].cluster.as_ref().and_then(|c| c.server.clone()).expect("a server")
     }
 
+    /// The controller's process.
+    #[must_use]
+    pub fn controller_pid(&self) -> u32 {
+        self.controller.as_ref().expect("it runs").id()
+    }
+
+    /// An agent's process.
+    #[must_use]
+    pub fn agent_pid(&self, name: &str) -> u32 {
+        self.agents[name].process.as_ref().expect("it runs").id()
+    }
+
     /// Kills the controller as a power cut would end it.
     pub fn kill_controller(&mut self) {
         let mut child = self.controller.take().expect("the controller runs");

@@ -74,3 +74,8 @@ pub async fn until<T, F: Future<Output = Result<T, String>>>(
         Err(_) => panic!("not {what} within {DEADLINE:?}; last: {last}"),
     }
 }
+
+/// Lets a span of time pass, for measurements over a span; never to wait for something.
+pub async fn idle(span: Duration) {
+    tokio::time::sleep(span).await;
+}

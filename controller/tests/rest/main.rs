@@ -1,4 +1,5 @@
 //! The controller as its clients see it: real TLS on a free port, a real store in a temporary directory.
+#![expect(clippy::unwrap_used, reason = "a failed step of a test is the test's failure")]
 
 mod access;
 mod objects;

@@ -1,0 +1,185 @@
+//! A node: what it has, what is reserved, who drives, where it is, what runs on it.
+
+use jiff::Timestamp;
+use muster_api::condition::{ConditionStatus, READY};
+use muster_api::kind::node::{Node, NodeStatus};
+use muster_api::kind::task::Task;
+use muster_api::name::FunctionName;
+use muster_api::resource::Compute;
+
+use super::{begin, condition_table, when};
+use crate::client::Selection;
+use crate::error::CliError;
+use crate::output::columns::task as columns;
+use crate::output::human;
+use crate::output::sheet::Sheet;
+use crate::output::style::Mood;
+use crate::output::table::{Cell, Table};
+use crate::session::Session;
+use crate::target;
+
+/// The tasks that hold something of the node.
+pub(super) async fn tasks_on(node: &Node, session: &Session) -> Result<Vec<Task>, CliError> {
+    let name = node.metadata.name.as_deref().unwrap_or_default();
+    let on = Selection { labels: None, fields: Some(format!("status.node={name}")) };
+    let list = session.client.list(target::kind("task")?, None, &on).await?;
+    let tasks = list.items.into_iter().filter_map(|o| serde_json::from_value::<Task>(o).ok());
+    Ok(tasks.filter(|t| t.status.as_ref().is_some_and(|s| s.phase.holds_node())).collect())
+}
+
+pub(super) fn describe(sheet: &mut Sheet, node: &Node, tasks: &[Task], now: Timestamp) {
+    begin(sheet, &node.metadata, now);
+    sheet.field("Kind", format!("{:?}", node.spec.kind));
+    if node.spec.unschedulable {
+        sheet.field("Cordoned", Cell::new("yes; nothing new is placed here", Mood::Warn));
+    }
+    let taints = node.spec.taints.iter();
+    sheet.list("Taints", taints.map(|t| format!("{}={}:{:?}", t.key, t.value, t.effect)));
+    sheet.maybe("Speed", node.spec.speed.map(|s| format!("{s} m/s")));
+    let Some(status) = &node.status else {
+        sheet.field("Ready", Cell::new("no agent has joined under this name yet", Mood::Warn));
+        return;
+    };
+    state(sheet, status, now);
+    sheet.table("Computation (CR)", compute_table(status));
+    sheet.table("Sensors (SR), shared", sensor_table(status, tasks));
+    sheet.table("Actuators (AR), one holder", actuator_table(status));
+    sheet.table("Runtimes", runtime_table(status));
+    sheet.table("Tasks", task_table(tasks));
+    sheet.table("Conditions", condition_table(&status.conditions, now));
+}
+
+fn state(sheet: &mut Sheet, status: &NodeStatus, now: Timestamp) {
+    let ready = match status.condition(READY) {
+        Some(c) if c.status == ConditionStatus::True => Cell::new("True", Mood::Good),
+        Some(c) if c.message.is_empty() => Cell::new(format!("{:?}", c.status), Mood::Bad),
+        Some(c) => Cell::new(format!("{:?}: {}", c.status, c.message), Mood::Bad),
+        None => Cell::new("no agent has joined under this name yet", Mood::Warn),
+    };
+    sheet.field("Ready", ready);
+    // What is written down of it is old while the node is connected, and would look like a fault.
+    if !status.is_ready() {
+        sheet.maybe("Last heard", status.last_seen.as_ref().map(|t| when(t.0, now)));
+    }
+    if let Some(pose) = &status.pose {
+        let mut text = format!("{:.2},{:.2}", pose.x, pose.y);
+        if pose.z != 0.0 {
+            text.push_str(&format!(",{:.2}", pose.z));
+        }
+        text.push_str(&format!(" in {:?}", pose.map));
+        if pose.yaw != 0.0 {
+            text.push_str(&format!(", heading {:.0}°", pose.yaw.to_degrees()));
+        }
+        if !pose.source.is_empty() {
+            text.push_str(&format!(", from {}", pose.source));
+        }
+        if let Some(stamp) = &pose.stamp {
+            text.push_str(&format!(", {} ago", human::age(stamp.0, now)));
+        }
+        let mood = if pose.localized { Mood::Plain } else { Mood::Bad };
+        if !pose.localized {
+            text.push_str(" (the robot does not know where it is)");
+        }
+        sheet.field("Pose", Cell::new(text, mood));
+    }
+    let some = |text: &String| Some(text.clone()).filter(|t| !t.is_empty());
+    sheet.maybe("Agent", some(&status.agent_version));
+    sheet.maybe("Address", some(&status.address));
+}
+
+fn compute_table(status: &NodeStatus) -> Table {
+    let mut table = Table::new(["", "FREE", "USED", "ALLOCATABLE", "CAPACITY"]);
+    let all = [&status.free, &status.used, &status.allocatable, &status.capacity];
+    let row = |name: &str, value: &dyn Fn(&Compute) -> String| {
+        std::iter::once(name.to_owned()).chain(all.iter().map(|c| value(c))).collect::<Vec<_>>()
+    };
+    table.push(row("cpu", &|c| human::cores(c.cpu)));
+    table.push(row("memory", &|c| human::bytes(c.memory)));
+    for name in status.capacity.extended.keys() {
+        table.push(row(name, &|c| c.extended.get(name).copied().unwrap_or(0).to_string()));
+    }
+    table
+}
+
+fn sensor_table(status: &NodeStatus, tasks: &[Task]) -> Table {
+    let mut table = Table::new(["SENSOR", "SHARED BY"]);
+    for sensor in &status.sensors {
+        let users = tasks.iter().filter(|t| t.spec.resources.sensors.contains(sensor)).count();
+        table.push([sensor.to_string(), human::count(users, "task")]);
+    }
+    table
+}
+
+fn actuator_table(status: &NodeStatus) -> Table {
+    let mut table = Table::new(["ACTUATOR", "GROUP", "EPOCH", "HOLDER"]);
+    let row = |actuator: &FunctionName, lease: Option<&muster_api::kind::node::NodeLease>| {
+        let holder = match lease {
+            None => Cell::from("-"),
+            Some(lease) => match &lease.holder {
+                Some(h) => format!("{}/{}", h.namespace, h.name).into(),
+                None => Cell::new("free", Mood::Good),
+            },
+        };
+        [
+            actuator.to_string().into(),
+            lease.map(|l| l.group.clone()).unwrap_or_default().into(),
+            lease.map(|l| l.epoch.to_string()).unwrap_or_default().into(),
+            holder,
+        ]
+    };
+    // Which group an actuator is in matters only where there are several; the Lease objects say it.
+    let only = match &status.leases[..] {
+        [only] => Some(only),
+        _ => None,
+    };
+    for actuator in &status.actuators {
+        table.push(row(actuator, only));
+    }
+    if only.is_none() {
+        for lease in &status.leases {
+            let holder = lease.holder.as_ref().map(|h| format!("{}/{}", h.namespace, h.name));
+            table.push([
+                "(group)".to_owned(),
+                lease.group.clone(),
+                lease.epoch.to_string(),
+                holder.unwrap_or_else(|| "free".to_owned()),
+            ]);
+        }
+    }
+    table
+}
+
+fn runtime_table(status: &NodeStatus) -> Table {
+    let mut table = Table::new(["RUNTIME", "USABLE", "VERSION", "MESSAGE"]);
+    for runtime in &status.runtimes {
+        let usable = match runtime.available {
+            true => Cell::new("yes", Mood::Good),
+            false => Cell::new("no", Mood::Warn),
+        };
+        table.push([
+            Cell::from(&runtime.name),
+            usable,
+            Cell::from(&runtime.version),
+            Cell::from(&runtime.message),
+        ]);
+    }
+    table
+}
+
+fn task_table(tasks: &[Task]) -> Table {
+    let mut table = Table::new(["NAMESPACE", "NAME", "PHASE", "CLASS", "CPU", "MEMORY", "EPOCH"]);
+    for task in tasks {
+        let status = task.status.clone().unwrap_or_default();
+        let resources = &task.spec.resources;
+        table.push([
+            Cell::from(task.metadata.namespace.as_deref().unwrap_or_default()),
+            Cell::from(task.metadata.name.as_deref().unwrap_or_default()),
+            Cell::new(status.phase.as_str(), columns::mood(status.phase)),
+            resources.class().into(),
+            resources.cpu.map(human::cores).unwrap_or_default().into(),
+            resources.memory.map(human::bytes).unwrap_or_default().into(),
+            status.lease.map(|l| l.epoch.to_string()).unwrap_or_default().into(),
+        ]);
+    }
+    table
+}

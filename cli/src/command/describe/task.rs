@@ -1,0 +1,167 @@
+//! A task: what it is, where it may run, what it needs and has, why it waits.
+
+use jiff::Timestamp;
+use muster_api::kind::task::{
+    ContainerRun, Cost, EnvVar, NodeChoice, Placement, ProcessRun, Resources, Task, TaskSpec,
+    TaskStatus,
+};
+
+use super::{begin, when};
+use crate::command::why::refusal_table;
+use crate::output::columns::task as columns;
+use crate::output::human;
+use crate::output::sheet::Sheet;
+use crate::output::table::Cell;
+
+pub(super) fn describe(sheet: &mut Sheet, task: &Task, now: Timestamp) {
+    begin(sheet, &task.metadata, now);
+    let status = task.status.clone().unwrap_or_default();
+    state(sheet, task, &status, now);
+    placement(sheet, &task.spec.placement);
+    resources(sheet, &task.spec.resources, &status);
+    program(sheet, &task.spec);
+    if !status.why.is_empty() {
+        sheet.table("Why it waits", refusal_table(&status.why));
+    }
+}
+
+fn state(sheet: &mut Sheet, task: &Task, status: &TaskStatus, now: Timestamp) {
+    sheet.field("Phase", Cell::new(status.phase.as_str(), columns::mood(status.phase)));
+    let some = |text: &String| Some(text.clone()).filter(|t| !t.is_empty());
+    sheet.maybe("Reason", some(&status.reason));
+    sheet.maybe("Message", some(&status.message));
+    sheet.field("Class", task.spec.resources.class());
+    sheet.field("Priority", task.spec.priority.to_string());
+    sheet.maybe("Node", status.node.clone());
+    let cost = task.spec.placement.cost;
+    sheet.maybe("Score", status.score.map(|s| columns::score(s, cost)));
+    sheet.maybe("Lease", status.lease.as_ref().map(|l| format!("{}, epoch {}", l.name, l.epoch)));
+    if status.attempt > 0 {
+        sheet.field("Attempt", status.attempt.to_string());
+    }
+    sheet.maybe("Placed", status.bound_at.as_ref().map(|t| when(t.0, now)));
+    sheet.maybe("Started", status.started_at.as_ref().map(|t| when(t.0, now)));
+    sheet.maybe("Ended", status.finished_at.as_ref().map(|t| when(t.0, now)));
+    sheet.maybe("Exit", some(&columns::exit(status)));
+}
+
+fn placement(sheet: &mut Sheet, placement: &Placement) {
+    sheet.heading("Placement");
+    if let Some(at) = &placement.at {
+        let mut text = format!("{:.2},{:.2}", at.x, at.y);
+        if at.z != 0.0 {
+            text.push_str(&format!(",{:.2}", at.z));
+        }
+        text.push_str(&format!(" in {:?}", at.map));
+        if let Some(within) = placement.within {
+            text.push_str(&format!(", within {within} m"));
+        }
+        sheet.field("At", text);
+        let cost = match placement.cost {
+            Cost::Distance => "distance",
+            Cost::TravelTime => "travel time",
+        };
+        sheet.field("Scored by", cost);
+    }
+    sheet.field(
+        "On",
+        match placement.on {
+            NodeChoice::Any => "any node",
+            NodeChoice::Robot => "Robot",
+            NodeChoice::Cloud => "Cloud",
+        },
+    );
+    sheet.maybe("Pinned to", placement.node.clone());
+    if !placement.selector.is_empty() {
+        sheet.field("With labels", placement.selector.to_string());
+    }
+    let tolerations = placement.tolerations.iter().map(|t| {
+        let effect = t.effect.map_or_else(|| "every effect".to_owned(), |e| format!("{e:?}"));
+        match (t.key.is_empty(), t.value.is_empty()) {
+            (true, _) => format!("every taint, {effect}"),
+            (false, true) => format!("{}, {effect}", t.key),
+            (false, false) => format!("{}={}, {effect}", t.key, t.value),
+        }
+    });
+    sheet.list("Tolerates", tolerations);
+}
+
+fn resources(sheet: &mut Sheet, resources: &Resources, status: &TaskStatus) {
+    sheet.heading("Resources");
+    let usage = status.usage.as_ref();
+    let with_use = |limit: Option<String>, used: Option<String>| {
+        let limit = limit.unwrap_or_else(|| "none reserved".to_owned());
+        match used {
+            Some(used) => format!("{limit} (uses {used})"),
+            None => limit,
+        }
+    };
+    sheet.field(
+        "Cpu",
+        with_use(resources.cpu.map(human::cores), usage.map(|u| human::cores(u.cpu))),
+    );
+    let memory = resources.memory.map(human::bytes);
+    sheet.field("Memory", with_use(memory, usage.map(|u| human::bytes(u.memory))));
+    sheet.list("Extended", resources.extended.iter().map(|(name, n)| format!("{name}: {n}")));
+    if let Some(io) = &resources.io {
+        sheet.maybe("Reads", io.read_bps.map(|b| format!("{}/s at most", human::bytes(b))));
+        sheet.maybe("Writes", io.write_bps.map(|b| format!("{}/s at most", human::bytes(b))));
+    }
+    sheet.maybe("Processes", resources.pids.map(|n| format!("{n} at most")));
+    sheet.list("Sensors", resources.sensors.iter().map(ToString::to_string));
+    sheet.list("Actuators", resources.actuators.iter().map(ToString::to_string));
+}
+
+fn program(sheet: &mut Sheet, spec: &TaskSpec) {
+    sheet.heading("Program");
+    if let Some(container) = &spec.run.container {
+        of_container(sheet, container);
+    }
+    if let Some(process) = &spec.run.process {
+        of_process(sheet, process);
+    }
+    sheet.field("Restarts", format!("{:?}", spec.restart_policy));
+    sheet.field("Grace", format!("{}s", spec.grace_period_seconds));
+    let without_contact = match spec.stop_after_disconnect() {
+        Some(after) => format!("stops after {after}"),
+        None => "goes on".to_owned(),
+    };
+    sheet.field("If cut off", without_contact);
+}
+
+fn of_container(sheet: &mut Sheet, container: &ContainerRun) {
+    sheet.field("Image", format!("{} (pulled {:?})", container.image, container.pull_policy));
+    let line: Vec<String> = container.command.iter().chain(&container.args).cloned().collect();
+    if !line.is_empty() {
+        sheet.field("Command", command_line(&line));
+    }
+    sheet.field("Network", format!("{:?}", container.network));
+    let mounts = container.mounts.iter().map(|m| {
+        let how = if m.read_only { " (read only)" } else { "" };
+        format!("{} → {}{how}", m.host_path, m.mount_path)
+    });
+    sheet.list("Mounts", mounts);
+    environment(sheet, &container.env);
+    sheet.maybe("Directory", container.working_dir.clone());
+}
+
+fn of_process(sheet: &mut Sheet, process: &ProcessRun) {
+    let line: Vec<String> = process.command.iter().chain(&process.args).cloned().collect();
+    sheet.field("Process", command_line(&line));
+    sheet.maybe("User", process.user.clone());
+    environment(sheet, &process.env);
+    sheet.maybe("Directory", process.working_dir.clone());
+}
+
+fn environment(sheet: &mut Sheet, all: &[EnvVar]) {
+    sheet.list("Environment", all.iter().map(|v| format!("{}={}", v.name, v.value)));
+}
+
+/// The words of a command; those that a shell would split are quoted, so that it is seen where each ends.
+fn command_line(words: &[String]) -> String {
+    let plain = |w: &str| {
+        !w.is_empty() && w.chars().all(|c| c.is_ascii_alphanumeric() || "-_./=:,@%+".contains(c))
+    };
+    let word = |w: &String| if plain(w) { w.clone() } else { format!("{w:?}") };
+    words.iter().map(word).collect::<Vec<_>>().join(" ")
+}

@@ -1,0 +1,288 @@
+//! `muster plan`: what applying manifests would do, decided by the real scheduler on a copy of what
+//! it knows. Exit code 0: nothing; 1: there are changes; 255: no plan could be made.
+
+use std::path::PathBuf;
+
+use muster_api::id::Epoch;
+use muster_api::kind::lease::LeaseSpec;
+use muster_api::kind::task::NodeRefusal;
+use serde::Deserialize;
+use serde_json::{Value, json};
+
+use super::Outcome;
+use super::apply::{self, Action, Step};
+use super::why::refusal_table;
+use crate::client::group_path;
+use crate::error::CliError;
+use crate::exit;
+use crate::manifests::{self, Manifest};
+use crate::merge::FieldChange;
+use crate::output::human;
+use crate::output::objects::{Format, document};
+use crate::output::style::Styles;
+use crate::session::Session;
+use crate::target;
+
+/// `muster plan`.
+#[derive(Debug, clap::Args)]
+pub(crate) struct Args {
+    /// A manifest, a directory of them, or - for standard input; may be given several times
+    #[arg(short, long = "filename", value_name = "FILE|DIR|-", required = true)]
+    filename: Vec<PathBuf>,
+    /// Print what the controller says, for programs
+    #[arg(short, long, value_enum, value_name = "FORMAT")]
+    output: Option<Format>,
+}
+
+/// What `POST …/plan` answers.
+#[derive(Debug, Deserialize)]
+struct Plan {
+    #[serde(default)]
+    changes: Vec<PlannedChange>,
+    #[serde(default)]
+    placements: Vec<Placement>,
+    #[serde(default)]
+    waits: Vec<Wait>,
+    #[serde(default)]
+    revision: String,
+}
+
+#[derive(Debug, Deserialize)]
+struct PlannedChange {
+    action: What,
+    kind: String,
+    #[serde(default)]
+    namespace: Option<String>,
+    name: String,
+    #[serde(default)]
+    fields: Vec<PlannedField>,
+}
+
+#[derive(Debug, Deserialize)]
+struct PlannedField {
+    path: String,
+    #[serde(default)]
+    from: Option<Value>,
+    #[serde(default)]
+    to: Option<Value>,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "camelCase")]
+enum What {
+    Create,
+    Update,
+    Unchanged,
+}
+
+#[derive(Debug, Deserialize)]
+struct Placement {
+    namespace: String,
+    name: String,
+    node: String,
+    #[serde(default)]
+    score: Option<f64>,
+    #[serde(default)]
+    leases: Vec<PlannedLease>,
+}
+
+#[derive(Debug, Deserialize)]
+struct PlannedLease {
+    group: String,
+    epoch: Epoch,
+}
+
+#[derive(Debug, Deserialize)]
+struct Wait {
+    namespace: String,
+    name: String,
+    #[serde(default)]
+    why: Vec<NodeRefusal>,
+}
+
+pub(crate) async fn run(args: Args, session: &mut Session) -> Outcome {
+    let manifests = manifests::load(&args.filename, &session.namespace, session.namespace_given)?;
+    let objects: Vec<Value> = manifests.iter().map(|m| m.admitted.clone()).collect();
+    let steps = apply::look_at_all(&session.client, manifests).await?;
+    apply::rehearse(&session.client, &steps).await?;
+    let uri = group_path("plan");
+    let mut answer: Value = session.client.post_json(&uri, &json!({"objects": objects})).await?;
+    // The controller plans placements; which fields apply would change, only apply's own rules say.
+    answer["changes"] = steps.iter().map(change).collect();
+    let plan: Plan = serde_json::from_value(answer.clone()).map_err(|source| CliError::Answer {
+        server: session.client.server.clone(),
+        request: format!("POST {uri}"),
+        source,
+    })?;
+    match args.output {
+        Some(format @ (Format::Yaml | Format::Json)) => {
+            session.ui.print(&document(&answer, format)?)?;
+        }
+        _ => {
+            let text = render(&plan, &session.ui.styles);
+            session.ui.print(&text)?;
+        }
+    }
+    let changes = plan.changes.iter().any(|c| c.action != What::Unchanged);
+    Ok(if changes { exit::FAILURE } else { exit::OK })
+}
+
+fn change(step: &Step) -> Value {
+    let none: &[FieldChange] = &[];
+    let (action, fields) = match &step.action {
+        Action::Create(_) => ("create", none),
+        Action::Patch { fields, .. } if !fields.is_empty() => ("update", &fields[..]),
+        Action::Patch { .. } | Action::Nothing(_) => ("unchanged", none),
+    };
+    let fields: Vec<Value> =
+        fields.iter().map(|f| json!({"path": f.path, "from": f.from, "to": f.to})).collect();
+    let Manifest { info, namespace, name, .. } = &step.manifest;
+    json!({
+        "action": action, "kind": info.kind, "namespace": namespace, "name": name, "fields": fields,
+    })
+}
+
+/// A line a change, with where the task would go or what would keep it from going anywhere.
+fn render(plan: &Plan, styles: &Styles) -> String {
+    let mut text = String::new();
+    for change in plan.changes.iter().filter(|c| c.action != What::Unchanged) {
+        let (sign, paint) = match change.action {
+            What::Create => ("+", styles.good),
+            What::Update | What::Unchanged => ("~", styles.warn),
+        };
+        let kind = target::kind(&change.kind)
+            .map_or_else(|_| change.kind.to_lowercase(), |i| i.singular.to_owned());
+        let place = change.namespace.as_ref().map(|ns| format!(" in {ns}")).unwrap_or_default();
+        text.push_str(&format!("{} {kind}/{}{place}", paint.paint(sign), change.name));
+        let is_it = |namespace: &str, name: &str| {
+            change.kind == "Task"
+                && change.namespace.as_deref() == Some(namespace)
+                && change.name == name
+        };
+        if let Some(placement) = plan.placements.iter().find(|p| is_it(&p.namespace, &p.name)) {
+            text.push_str(&placed(placement));
+        }
+        text.push('\n');
+        for field in &change.fields {
+            text.push_str(&format!("    {}\n", describe(field)));
+        }
+        if let Some(wait) = plan.waits.iter().find(|w| is_it(&w.namespace, &w.name)) {
+            text.push_str(&format!("    {}\n", styles.warn.paint("would wait:")));
+            for line in refusal_table(&wait.why).text(styles).lines() {
+                text.push_str(&format!("    {line}\n"));
+            }
+        }
+    }
+    text.push_str(&summary(plan));
+    text
+}
+
+fn describe(field: &PlannedField) -> String {
+    let text = |value: &Option<Value>| value.as_ref().map(|v| human::plain(&v.to_string()));
+    match (text(&field.from), text(&field.to)) {
+        (None, to) => format!("{}: set to {}", field.path, to.unwrap_or_default()),
+        (Some(from), None) => format!("{}: {from} is removed", field.path),
+        (Some(from), Some(to)) => format!("{}: {from} → {to}", field.path),
+    }
+}
+
+fn placed(placement: &Placement) -> String {
+    let mut text = format!(" → {}", placement.node);
+    if let Some(score) = placement.score {
+        text.push_str(&format!(", score {score:.2}"));
+    }
+    for lease in &placement.leases {
+        let name = LeaseSpec::object_name(&placement.node, &lease.group);
+        text.push_str(&format!(", lease {name} epoch {}", lease.epoch));
+    }
+    text
+}
+
+fn summary(plan: &Plan) -> String {
+    let of = |action| plan.changes.iter().filter(|c| c.action == action).count();
+    let (create, update, same) = (of(What::Create), of(What::Update), of(What::Unchanged));
+    if create + update == 0 {
+        return format!("Nothing to do: {} as the manifests say.\n", human::count(same, "object"));
+    }
+    let mut text = format!("\nPlan: {create} to create, {update} to change, {same} unchanged.");
+    let (placed, waits) = (plan.placements.len(), plan.waits.len());
+    if placed + waits > 0 {
+        text.push_str(&format!(
+            " {placed} of {} would be placed at once.",
+            human::count(placed + waits, "new task")
+        ));
+    }
+    if !plan.revision.is_empty() {
+        text.push_str(&format!(" As of revision {}.", plan.revision));
+    }
+    text.push('\n');
+    text
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use crate::exit;
+    use crate::fake::Fake;
+
+    const PLAN: &str = "POST /apis/muster.dev/v1alpha1/plan";
+
+    fn manifest(dir: &tempfile::TempDir) -> String {
+        let path = dir.path().join("t.yaml");
+        let task = |name: &str| {
+            format!(
+                "apiVersion: muster.dev/v1alpha1\nkind: Task\nmetadata: {{name: {name}}}\nspec: {{priority: 2, run: {{process: {{command: [x]}}}}}}\n"
+            )
+        };
+        std::fs::write(&path, format!("{}---\n{}", task("a"), task("b"))).expect("written");
+        path.display().to_string()
+    }
+
+    #[tokio::test]
+    async fn the_exit_code_says_whether_there_are_changes() {
+        let dir = tempfile::tempdir().expect("a directory");
+        let path = manifest(&dir);
+        let fake = Fake::new();
+        let lease = json!({"group": "body", "epoch": 4});
+        let refusal = json!({"node": "r1", "reason": "LeaseHeld", "message": "held"});
+        fake.answer(PLAN, json!({
+            "placements": [{"namespace": "default", "name": "a", "node": "r1", "score": 2.345, "leases": [lease]}],
+            "waits": [{"namespace": "default", "name": "b", "why": [refusal]}],
+            "revision": "7",
+        }));
+        let (code, text) = fake.run(&["plan", "-f", &path]).await;
+        assert_eq!(code, exit::FAILURE);
+        assert_eq!(
+            text,
+            "+ task/a in default → r1, score 2.35, lease r1.body epoch 4\n\
+             + task/b in default\n    would wait:\n    NODE   REFUSED BY   WHY\n    r1     LeaseHeld    held\n\
+             \nPlan: 2 to create, 0 to change, 0 unchanged. 1 of 2 new tasks would be placed at once. As of revision 7.\n"
+        );
+        assert_eq!(fake.object("tasks/default/a"), None, "a plan stores nothing");
+        fake.answer(PLAN, json!({"revision": "8"}));
+        fake.run(&["apply", "-f", &path]).await;
+        let nothing = "Nothing to do: 2 objects as the manifests say.\n".to_owned();
+        assert_eq!(fake.run(&["plan", "-f", &path]).await, (exit::OK, nothing));
+        fake.edit("tasks/default/a", |o| o["spec"]["priority"] = json!(9));
+        let (code, text) = fake.run(&["plan", "-f", &path]).await;
+        assert_eq!(code, exit::FAILURE);
+        assert_eq!(
+            text,
+            "~ task/a in default\n    spec.priority: 9 → 2\n\n\
+             Plan: 0 to create, 1 to change, 1 unchanged. As of revision 8.\n"
+        );
+    }
+
+    #[tokio::test]
+    async fn what_is_sent_has_its_namespace_and_defaults() {
+        let dir = tempfile::tempdir().expect("a directory");
+        let path = manifest(&dir);
+        let fake = Fake::new();
+        fake.answer(PLAN, json!({}));
+        fake.run(&["plan", "-f", &path, "-n", "lab"]).await;
+        let body = fake.last_body();
+        assert_eq!(body["objects"][0]["metadata"]["namespace"], "lab");
+        assert_eq!(body["objects"][0]["spec"]["restartPolicy"], "Never");
+    }
+}

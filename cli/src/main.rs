@@ -1,0 +1,55 @@
+//! `muster`: the client verbs, and the daemons behind the same binary.
+//!
+//! | module | holds |
+//! |---|---|
+//! | [`args`], [`target`] | the command line; which objects its words name |
+//! | [`config`], [`client`], [`watch`] | kubeconfig; REST; following a collection |
+//! | [`manifests`], [`merge`] | files → checked objects; three-way merge |
+//! | [`command`] | one file a verb |
+//! | [`output`] | tables, sheets, progress |
+//! | [`error`], [`exit`] | classes of errors, their hints and exit codes |
+
+mod args;
+mod client;
+mod command;
+mod config;
+mod demo;
+mod error;
+mod exit;
+#[cfg(test)]
+mod fake;
+mod manifests;
+mod merge;
+mod output;
+mod session;
+mod target;
+mod watch;
+mod workload;
+
+use std::process::ExitCode;
+
+use clap::Parser as _;
+
+use crate::error::CliError;
+use crate::output::ui::Ui;
+
+fn main() -> ExitCode {
+    let mut args = std::env::args_os();
+    // Before anything else: a shim must stay small, and it has no use for the rest.
+    if args.nth(1).is_some_and(|verb| verb == muster_agent::shim::VERB) {
+        muster_agent::shim::main(args);
+    }
+    // Before anything makes a TLS configuration. An error means that there is a provider already.
+    let _ = rustls::crypto::ring::default_provider().install_default();
+    let cli = args::Cli::parse();
+    let color = cli.global.color;
+    match command::run(cli) {
+        Ok(code) => code,
+        // Whoever read our output left with what they wanted: `muster get tasks | head -1`.
+        Err(CliError::BrokenPipe) => ExitCode::from(exit::OK),
+        Err(error) => {
+            Ui::of_process(color).report(&error);
+            ExitCode::from(error.class().exit())
+        }
+    }
+}

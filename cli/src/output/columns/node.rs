@@ -1,0 +1,154 @@
+//! Nodes: can it take tasks, what is left of it, who drives it, where it is.
+
+use muster_api::condition::ConditionStatus;
+use muster_api::kind::node::{Node, NodeStatus};
+use muster_api::name::FunctionName;
+use muster_api::resource::{Compute, format_function_list};
+
+use super::{Column, age};
+use crate::output::human;
+use crate::output::style::Mood;
+use crate::output::table::Cell;
+
+pub(super) const COLUMNS: &[Column<Node>] = &[
+    Column::new("KIND", |node, _| format!("{:?}", node.spec.kind).into()),
+    Column::new("READY", |node, _| ready(node)),
+    Column::new("CPU", |node, _| {
+        of_compute(node, |free, whole| {
+            format!("{}/{}", human::cores(free.cpu), human::cores(whole.cpu))
+        })
+    }),
+    Column::new("MEMORY", |node, _| {
+        of_compute(node, |free, whole| {
+            format!("{}/{}", human::bytes(free.memory), human::bytes(whole.memory))
+        })
+    }),
+    Column::new("LEASE", |node, _| status(node, holders)),
+    Column::new("POSE", |node, _| status(node, pose)),
+    Column::new("AGE", |node, now| age(node.metadata.creation_timestamp.as_ref(), now)),
+    Column::wide("SENSORS", |node, _| status(node, |s| functions(&s.sensors))),
+    Column::wide("ACTUATORS", |node, _| status(node, |s| functions(&s.actuators))),
+    Column::wide("RUNTIMES", |node, _| status(node, runtimes)),
+    Column::wide("AGENT", |node, _| status(node, |s| s.agent_version.clone())),
+    Column::wide("ADDRESS", |node, _| status(node, |s| s.address.clone())),
+];
+
+fn status(node: &Node, text: impl Fn(&NodeStatus) -> String) -> Cell {
+    node.status.as_ref().map(text).unwrap_or_default().into()
+}
+
+/// Free and allocatable; nothing of a node whose agent has not said yet what it has.
+fn of_compute(node: &Node, text: impl Fn(&Compute, &Compute) -> String) -> Cell {
+    status(node, |s| match s.allocatable == Compute::default() {
+        true => String::new(),
+        false => text(&s.free, &s.allocatable),
+    })
+}
+
+/// Whether the node takes tasks now. `cordoned` and readiness are two things, and both are shown.
+fn ready(node: &Node) -> Cell {
+    let condition = node.status.as_ref().and_then(|s| s.condition(muster_api::condition::READY));
+    let (text, mood) = match condition.map(|c| c.status) {
+        Some(ConditionStatus::True) => ("True", Mood::Good),
+        Some(ConditionStatus::False) => ("False", Mood::Bad),
+        Some(ConditionStatus::Unknown) => ("Unknown", Mood::Bad),
+        // Registered; no agent has joined under this name yet.
+        None => ("NotJoined", Mood::Warn),
+    };
+    match node.spec.unschedulable {
+        true => Cell::new(format!("{text},Cordoned"), Mood::Warn),
+        false => Cell::new(text, mood),
+    }
+}
+
+/// `gmapping` for the holder of the only group; with several groups `arm=grasp,body=-`.
+fn holders(status: &NodeStatus) -> String {
+    let of = |lease: &muster_api::kind::node::NodeLease| {
+        lease
+            .holder
+            .as_ref()
+            .map_or_else(|| "-".to_owned(), |h| format!("{}/{}", h.namespace, h.name))
+    };
+    match &status.leases[..] {
+        [] => String::new(),
+        [only] if only.holder.is_none() => "free".to_owned(),
+        [only] => of(only),
+        several => {
+            let all: Vec<String> =
+                several.iter().map(|l| format!("{}={}", l.group, of(l))).collect();
+            all.join(",")
+        }
+    }
+}
+
+fn pose(status: &NodeStatus) -> String {
+    match &status.pose {
+        None => String::new(),
+        Some(pose) if pose.localized => pose.to_string(),
+        Some(pose) => format!("{pose} (lost)"),
+    }
+}
+
+fn functions(all: &[FunctionName]) -> String {
+    format_function_list(&all.iter().cloned().collect())
+}
+
+fn runtimes(status: &NodeStatus) -> String {
+    let usable: Vec<&str> =
+        status.runtimes.iter().filter(|r| r.available).map(|r| r.name.as_str()).collect();
+    usable.join(",")
+}
+
+#[cfg(test)]
+mod tests {
+    use jiff::Timestamp;
+    use serde_json::json;
+
+    use crate::output::columns::{Layout, table};
+    use crate::output::style::Styles;
+
+    #[test]
+    fn a_robot_shows_what_is_left_who_drives_and_where_it_is() {
+        let info = muster_api::kind::find_by_word("node").expect("served");
+        let robot = json!({
+            "apiVersion": "muster.dev/v1alpha1", "kind": "Node",
+            "metadata": {"name": "turtlebot-1", "creationTimestamp": "1970-01-01T00:00:00Z"},
+            "spec": {"kind": "Robot", "unschedulable": true},
+            "status": {
+                "allocatable": {"cpu": "2", "memory": "4Gi"},
+                "free": {"cpu": "1500m", "memory": "3Gi"},
+                "sensors": ["kinect:LaserGen", "kinect:ImageGen"],
+                "actuators": ["base:Drive"],
+                "leases": [{"group": "body", "epoch": 3, "holder": {"namespace": "default", "name": "gmapping", "uid": "u"}}],
+                "pose": {"x": 3, "y": 4.5},
+                "conditions": [{"type": "Ready", "status": "True"}],
+                "runtimes": [{"name": "process", "available": true}, {"name": "docker", "available": false}],
+                "agentVersion": "0.1.0",
+            },
+        });
+        let registered = json!({
+            "apiVersion": "muster.dev/v1alpha1", "kind": "Node",
+            "metadata": {"name": "cloud-1"}, "spec": {"kind": "Cloud"},
+        });
+        let layout = |wide| Layout {
+            wide,
+            namespaces: true,
+            kinds: false,
+            now: Timestamp::from_second(65).expect("in range"),
+        };
+        let text = |wide| {
+            table(info, &[robot.clone(), registered.clone()], layout(wide)).text(&Styles::default())
+        };
+        assert_eq!(
+            text(false),
+            "NAME          KIND    READY           CPU     MEMORY    LEASE              POSE        AGE\n\
+             turtlebot-1   Robot   True,Cordoned   1.5/2   3Gi/4Gi   default/gmapping   3.00,4.50   65s\n\
+             cloud-1       Cloud   NotJoined       -       -         -                  -           -\n"
+        );
+        assert!(
+            text(true).contains("kinect:ImageGen,LaserGen   base:Drive   process    0.1.0"),
+            "{}",
+            text(true)
+        );
+    }
+}
