@@ -39,9 +39,18 @@ pub(super) struct TaskUse {
     pub(super) cpu_total_usec: u64,
 }
 
+/// What a node's whole machine uses.
+#[derive(Debug, Clone, Deserialize)]
+#[serde(rename_all = "camelCase")]
+pub(super) struct NodeUse {
+    pub(super) cpu_millis: u64,
+}
+
+/// The last heartbeats of all nodes.
 #[derive(Debug, Deserialize)]
-struct Usage {
-    tasks: Vec<TaskUse>,
+pub(super) struct Usage {
+    pub(super) nodes: Vec<NodeUse>,
+    pub(super) tasks: Vec<TaskUse>,
 }
 
 impl Api {
@@ -130,10 +139,9 @@ impl Api {
         }
     }
 
-    /// What running tasks use.
-    pub(super) async fn usage(&self) -> Result<Vec<TaskUse>, CliError> {
-        let usage: Usage = self.client.get_json(&group_path("usage")).await?;
-        Ok(usage.tasks)
+    /// What nodes and running tasks use.
+    pub(super) async fn usage(&self) -> Result<Usage, CliError> {
+        self.client.get_json(&group_path("usage")).await
     }
 
     /// The last lines of what a task wrote; nothing when its node does not have it yet.

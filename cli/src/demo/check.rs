@@ -188,6 +188,8 @@ mod tests {
             robot_millis: 1000,
             rows,
             totals,
+            others: 0.0,
+            cores: 2,
             checks: Vec::new(),
             seconds: 1.0,
         };

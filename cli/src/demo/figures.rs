@@ -49,6 +49,9 @@ pub(super) struct Report {
     pub(super) robot_millis: u64,
     pub(super) rows: Vec<Row>,
     pub(super) totals: Totals,
+    /// Most cores that anything else on this machine used during a measurement, and all it has.
+    pub(super) others: f64,
+    pub(super) cores: usize,
     pub(super) checks: Vec<Check>,
     pub(super) seconds: f64,
 }

@@ -113,19 +113,32 @@ fn now() -> f64 {
     SystemTime::now().duration_since(UNIX_EPOCH).map_or(0.0, |d| d.as_secs_f64())
 }
 
+/// What was measured.
+#[derive(Debug, Default)]
+pub(super) struct Found {
+    /// By name.
+    pub(super) tasks: BTreeMap<String, Measured>,
+    /// Cores that everything else on this machine used: the daemons, and what is no part of the demo.
+    pub(super) others: f64,
+}
+
 /// Measures tasks, given as (name, uid), for a time. `tell` hears the shares so far, by uid.
 pub(super) async fn measure(
     api: &Api,
     tasks: &[(String, String)],
     time: Duration,
     mut tell: impl FnMut(&BTreeMap<String, f64>),
-) -> Result<BTreeMap<String, Measured>, CliError> {
+) -> Result<Found, CliError> {
+    let mut machine = Vec::new();
     let mut tracks: BTreeMap<&str, Track> = BTreeMap::new();
     let mut memory = BTreeMap::new();
     let begin = now();
     let end = begin + time.as_secs_f64();
     while now() < end {
-        for usage in api.usage().await? {
+        let usage = api.usage().await?;
+        // All nodes of the demo are on one machine, and each sees all of it.
+        machine.extend(usage.nodes.iter().map(|n| n.cpu_millis as f64 / 1e3));
+        for usage in usage.tasks {
             let Some((name, uid)) = tasks.iter().find(|(_, uid)| *uid == usage.uid) else {
                 continue;
             };
@@ -136,13 +149,16 @@ pub(super) async fn measure(
         tell(&shares.collect());
         tokio::time::sleep(LOOK).await;
     }
-    let mut measured = BTreeMap::new();
+    let mut measured = Found::default();
     for (name, uid) in tasks {
         let said = read(&lines(&api.log(name, LOG_LINES).await?), begin, now());
         let cpu = tracks.get(uid.as_str()).and_then(Track::slope);
         let memory_bytes = memory.get(name.as_str()).copied();
-        measured.insert(name.clone(), Measured { cpu, memory_bytes, ..said });
+        measured.tasks.insert(name.clone(), Measured { cpu, memory_bytes, ..said });
     }
+    let all = machine.iter().sum::<f64>() / machine.len().max(1) as f64;
+    let ours: f64 = measured.tasks.values().filter_map(|m| m.cpu).sum();
+    measured.others = (all - ours).max(0.0);
     Ok(measured)
 }
 

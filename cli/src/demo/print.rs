@@ -10,7 +10,7 @@ use muster_api::kind::node::Node;
 use muster_api::kind::task::Task;
 
 use super::check::Check;
-use super::figures::{Report, Row, kept, percent};
+use super::figures::{Report, kept, percent};
 use super::measure::Measured;
 use crate::error::CliError;
 use crate::output::human;
@@ -23,6 +23,9 @@ use crate::output::ui::Ui;
 const WHY_LESS: &str = "Loads that add up give 3.00 over the mean: three workloads use three times their mean. The paper's \
 3.68 is more because its loads did not add up: gmapping and monitoring, 28.4 % alone, used 69.66 % together, \
 and its workloads take what cpu they get. Here each has a frame clock and does the same work as alone.";
+
+/// Cores that others may use without a word: the daemons and a desktop.
+const BUSY: f64 = 0.4;
 
 /// Where everything is printed.
 pub(super) struct Out<'a> {
@@ -127,8 +130,9 @@ impl<'a> Out<'a> {
             let text = serde_json::to_string_pretty(report).unwrap_or_default();
             return self.ui.line(&text);
         }
-        let text = table(report).text(&self.ui.styles);
-        self.ui.print(&format!("\n{text}\n"))?;
+        let (styles, places) = (&self.ui.styles, placements(report));
+        let text = format!("\n{}\n{}\n", places.text(styles), figures(report).text(styles));
+        self.ui.print(&text)?;
         for line in ratios(report) {
             self.ui.line(&line)?;
         }
@@ -136,6 +140,13 @@ impl<'a> Out<'a> {
         for check in &report.checks {
             let line = self.check(check);
             self.ui.line(&line)?;
+        }
+        if report.others > BUSY {
+            let text = self.ui.styles.warn.paint(format!(
+                "other processes used up to {:.1} of this machine's {} cores meanwhile: shares and throughputs suffer from it",
+                report.others, report.cores
+            ));
+            self.ui.line(&text)?;
         }
         self.ui.line(&format!("took {:.0} s", report.seconds))
     }
@@ -200,79 +211,75 @@ fn number(value: Option<f64>, digits: usize, unit: &str) -> String {
     value.map_or_else(|| "-".to_owned(), |value| format!("{value:.digits$}{unit}"))
 }
 
-fn table(report: &Report) -> Table {
+/// Who runs where, and by what right.
+fn placements(report: &Report) -> Table {
+    let mut table = Table::new(["TASK", "CLASS", "NODE", "SCORE", "LEASE", "EPOCH", "QUOTA"]);
+    for row in &report.rows {
+        let place = match (&row.node, &row.waits) {
+            (Some(node), _) => Cell::from(node),
+            (None, Some((reason, _))) => Cell::new(format!("waits: {reason}"), Mood::Warn),
+            (None, None) => Cell::new(&row.phase, Mood::Warn),
+        };
+        let (lease, epoch) = match &row.lease {
+            Some(held) => (held.name.clone(), held.epoch.to_string()),
+            None => Default::default(),
+        };
+        table.push([
+            Cell::from(&row.task),
+            Cell::from(&row.class),
+            place,
+            Cell::from(number(row.score, 2, " m")),
+            Cell::from(lease),
+            Cell::from(epoch),
+            Cell::from(row.quota_millis.map(|q| format!("{q}m")).unwrap_or_default()),
+        ]);
+    }
+    table
+}
+
+/// What each did: cpu as a part of the robot's CR, and its own work.
+fn figures(report: &Report) -> Table {
     let mut table = Table::new([
         "TASK",
-        "CLASS",
-        "NODE",
-        "SCORE",
-        "LEASE",
-        "QUOTA",
-        "ALONE",
         "PAPER",
+        "ALONE",
         "TWO",
         "THREE",
         "FULL",
         "WORK ALONE",
-        "WORK THREE",
+        "THREE",
         "KEPT",
         "P99 ALONE",
-        "P99 THREE",
+        "THREE",
     ]);
-    for row in &report.rows {
-        table.push(cells(row, report.robot_millis));
+    let with_sign = |value: Option<f64>| number(value, 1, "%");
+    let share = |m: &Option<Measured>| {
+        with_sign(m.and_then(|m| m.cpu).map(|c| percent(c, report.robot_millis)))
+    };
+    for row in report.rows.iter().filter(|row| row.node.is_some()) {
+        let of = |m: &Option<Measured>, field: fn(&Measured) -> Option<f64>, digits, unit| {
+            number(m.as_ref().and_then(field), digits, unit)
+        };
+        let kept = kept(row.alone.as_ref(), row.three.as_ref());
+        table.push([
+            row.task.clone(),
+            with_sign(row.paper_percent),
+            share(&row.alone),
+            share(&row.two),
+            share(&row.three),
+            share(&row.full),
+            of(&row.alone, |m| m.throughput, 1, "/s"),
+            of(&row.three, |m| m.throughput, 1, "/s"),
+            number(kept.map(|k| k * 100.0), 0, "%"),
+            of(&row.alone, |m| m.p99_ms, 0, " ms"),
+            of(&row.three, |m| m.p99_ms, 0, " ms"),
+        ]);
     }
     let totals = &report.totals;
-    let percent = |value: Option<f64>| number(value, 1, "%");
-    let mut total = vec![Cell::from("robot")];
-    total.extend([""; 5].map(Cell::from));
-    total.extend(
-        [
-            percent(totals.sum_alone),
-            String::new(),
-            percent(totals.two),
-            percent(totals.three),
-            percent(totals.full),
-        ]
-        .map(Cell::from),
-    );
-    total.extend([""; 5].map(Cell::from));
-    table.push(total);
+    let sums = [totals.sum_alone, totals.two, totals.three, totals.full].map(with_sign);
+    let robot = ["robot".to_owned(), String::new()].into_iter().chain(sums);
+    table.push(robot.chain([(); 5].map(|()| String::new())));
     table
-}
-
-fn cells(row: &Row, robot_millis: u64) -> Vec<Cell> {
-    let cpu = |m: &Option<Measured>| {
-        number(m.and_then(|m| m.cpu).map(|c| percent(c, robot_millis)), 1, "%")
-    };
-    let of = |m: &Option<Measured>, field: fn(&Measured) -> Option<f64>, digits, unit| {
-        number(m.as_ref().and_then(field), digits, unit)
-    };
-    let kept = kept(row.alone.as_ref(), row.three.as_ref());
-    let place = match (&row.node, &row.waits) {
-        (Some(node), _) => Cell::from(node),
-        (None, Some((reason, _))) => Cell::new(format!("waits: {reason}"), Mood::Warn),
-        (None, None) => Cell::new(&row.phase, Mood::Warn),
-    };
-    let lease = row.lease.as_ref().map(|held| format!("{} #{}", held.name, held.epoch));
-    vec![
-        Cell::from(&row.task),
-        Cell::from(&row.class),
-        place,
-        Cell::from(number(row.score, 2, "m")),
-        Cell::from(lease.unwrap_or_default()),
-        Cell::from(row.quota_millis.map(|q| format!("{q}m")).unwrap_or_default()),
-        Cell::from(cpu(&row.alone)),
-        Cell::from(number(row.paper_percent, 1, "%")),
-        Cell::from(cpu(&row.two)),
-        Cell::from(cpu(&row.three)),
-        Cell::from(cpu(&row.full)),
-        Cell::from(of(&row.alone, |m| m.throughput, 1, "/s")),
-        Cell::from(of(&row.three, |m| m.throughput, 1, "/s")),
-        Cell::from(number(kept.map(|k| k * 100.0), 0, "%")),
-        Cell::from(of(&row.alone, |m| m.p99_ms, 0, "ms")),
-        Cell::from(of(&row.three, |m| m.p99_ms, 0, "ms")),
-    ]
 }
 
 fn ratios(report: &Report) -> Vec<String> {
@@ -281,7 +288,7 @@ fn ratios(report: &Report) -> Vec<String> {
     let ratio = |value: Option<f64>| number(value, 2, "x");
     vec![
         format!(
-            "CPU columns are % of the robot's CR, {}m: alone, two together, three together, with more users of its camera.",
+            "CPU in % of the robot's CR, {}m: alone, two and three together, full with more users of its camera (their own row).",
             report.robot_millis
         ),
         format!(
@@ -310,6 +317,7 @@ fn ratios(report: &Report) -> Vec<String> {
 
 #[cfg(test)]
 mod tests {
+    use super::super::figures::Row;
     use super::super::figures::tests::rows;
     use super::super::figures::totals;
     use super::super::scenario::ROBOT;
@@ -319,21 +327,37 @@ mod tests {
     fn report() -> Report {
         let rows = rows();
         let totals = totals(&rows, ROBOT, 1000);
-        Report { quotas: None, robot_millis: 1000, rows, totals, checks: Vec::new(), seconds: 1.0 }
+        Report {
+            quotas: None,
+            robot_millis: 1000,
+            rows,
+            totals,
+            others: 0.9,
+            cores: 2,
+            checks: Vec::new(),
+            seconds: 1.0,
+        }
     }
 
     #[test]
-    fn the_table_has_a_row_a_task_and_one_for_the_robot() {
-        let text = table(&report()).text(&Styles::default());
+    fn a_table_has_a_row_a_task_and_one_for_the_robot() {
+        let text = figures(&report()).text(&Styles::default());
         let lines: Vec<&str> = text.lines().collect();
         assert_eq!(lines.len(), 5, "{text}");
         let words = |line: usize| lines[line].split_whitespace().collect::<Vec<_>>();
-        assert_eq!(
-            words(1)[..10],
-            ["gmapping", "AR-CR-SR", ROBOT, "2.83m", "-", "-", "15.3%", "15.3%", "15.3%", "15.3%"]
-        );
-        assert_eq!(words(4)[0], "robot");
-        assert!(words(4).contains(&"80.1%") && words(4).contains(&"28.4%"), "{text}");
+        let gmapping =
+            ["gmapping", "15.3%", "15.3%", "15.3%", "15.3%", "-", "10.0/s", "9.5/s", "95%"];
+        assert_eq!(words(1)[..9], gmapping);
+        assert_eq!(words(4)[..6], ["robot", "-", "80.1%", "28.4%", "80.1%", "-"]);
+    }
+
+    #[test]
+    fn who_waits_says_why() {
+        let mut report = report();
+        let waits = Some(("LeaseHeld".to_owned(), "held".to_owned()));
+        report.rows.push(Row { task: "second-driver".into(), waits, ..Row::default() });
+        let text = placements(&report).text(&Styles::default());
+        assert!(text.contains("waits: LeaseHeld") && text.contains("2.83 m"), "{text}");
     }
 
     #[test]

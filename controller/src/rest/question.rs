@@ -123,9 +123,10 @@ fn change_of(context: &Context, object: &Value) -> Result<Value, Failure> {
     let namespace = info.namespaced.then(|| text("/metadata/namespace").unwrap_or(DEFAULT));
     let present = context.store.get(&entry.key(namespace, name)).map(|s| s.value());
     let same = |present: &Value| {
-        let labels =
-            |o: &Value| o.pointer("/metadata/labels").cloned().unwrap_or_else(|| json!({}));
-        present["spec"] == object["spec"] && labels(present) == labels(object)
+        let asked = |part: &str| {
+            object.pointer(part).is_none_or(|o| present.pointer(part).is_some_and(|p| holds(p, o)))
+        };
+        ["/spec", "/metadata/labels", "/metadata/annotations"].iter().all(|part| asked(part))
     };
     let action = match &present {
         None => "create",
@@ -133,6 +134,16 @@ fn change_of(context: &Context, object: &Value) -> Result<Value, Failure> {
         Some(_) => "update",
     };
     Ok(json!({ "action": action, "kind": kind, "namespace": namespace, "name": name }))
+}
+
+/// Everything that `asked` says is so in `present`, which may say more: what the server filled in.
+fn holds(present: &Value, asked: &Value) -> bool {
+    match (present, asked) {
+        (Value::Object(present), Value::Object(asked)) => {
+            asked.iter().all(|(key, value)| present.get(key).is_some_and(|p| holds(p, value)))
+        }
+        _ => present == asked,
+    }
 }
 
 fn demand(index: usize, object: &Value, revision: u64) -> Result<Demand, Failure> {
