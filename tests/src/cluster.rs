@@ -75,8 +75,13 @@ impl AgentOptions {
     }
 }
 
-/// The directory of the binaries that were built with this test.
-fn binary(name: &str) -> PathBuf {
+/// A binary that was built with this test.
+///
+/// # Panics
+///
+/// When it is not there.
+#[must_use]
+pub fn binary(name: &str) -> PathBuf {
     let test = std::env::current_exe().expect("a test has a path");
     let profile = test.parent().and_then(Path::parent).expect("tests are in target/PROFILE/deps");
     let path = profile.join(name);

@@ -30,7 +30,11 @@ pub(crate) async fn between_syncs<T>(dir: &Path, work: impl Future<Output = T>) 
     let value = work.await;
     let after = fdatasync(dir);
     let swing = before.max(after).as_secs_f64() / before.min(after).as_secs_f64();
-    println!("  fdatasync 4 KiB p50: {:.3} ms before, {:.3} ms after", millis(before), millis(after));
+    println!(
+        "  fdatasync 4 KiB p50: {:.3} ms before, {:.3} ms after",
+        millis(before),
+        millis(after)
+    );
     if swing > 2.0 {
         println!("  VOID: the disk swung by {swing:.1}x during the run");
     }
@@ -62,7 +66,8 @@ impl Rows {
     pub(crate) async fn commit(&mut self, rows: usize) -> Duration {
         let value = "x".repeat(1500);
         let begin = Instant::now();
-        let mut transaction = self.connection.begin_with("BEGIN IMMEDIATE").await.expect("the only writer");
+        let mut transaction =
+            self.connection.begin_with("BEGIN IMMEDIATE").await.expect("the only writer");
         for _ in 0..rows {
             self.next += 1;
             sqlx::query("INSERT INTO rows VALUES (?, ?)")

@@ -21,8 +21,15 @@ fn rss(pid: u32) -> f64 {
 /// Cpu time that a process has used.
 fn cpu(pid: u32) -> Duration {
     let stat = std::fs::read_to_string(format!("/proc/{pid}/stat")).expect("it runs");
-    let fields: Vec<u64> =
-        stat.rsplit_once(')').expect("a name").1.split_whitespace().skip(11).take(2).map(|f| f.parse().expect("ticks")).collect();
+    let fields: Vec<u64> = stat
+        .rsplit_once(')')
+        .expect("a name")
+        .1
+        .split_whitespace()
+        .skip(11)
+        .take(2)
+        .map(|f| f.parse().expect("ticks"))
+        .collect();
     // USER_HZ is 100 on every Linux that Debian builds.
     Duration::from_millis(fields.iter().sum::<u64>() * 10)
 }
@@ -38,7 +45,12 @@ pub(crate) async fn all() {
     figure("agent, idle: RSS", rss(agent), " MB", "<= 9 MB");
     let percent = |used: Duration| used.as_secs_f64() / IDLE.as_secs_f64() * 100.0;
     figure("agent, idle: CPU of one core", percent(cpu(agent) - agent_before), " %", "report");
-    figure("controller, one agent, idle: CPU of one core", percent(cpu(controller) - controller_before), " %", "report");
+    figure(
+        "controller, one agent, idle: CPU of one core",
+        percent(cpu(controller) - controller_before),
+        " %",
+        "report",
+    );
     crate::list::fill(&cluster, 10_000).await;
     let client = cluster.client().await;
     let make = |i: usize| {

@@ -20,7 +20,8 @@ pub(crate) async fn nodes() {
     let (mut floor, mut ours) = (Samples::default(), Samples::default());
     let mut size = 0;
     for _ in 0..ROUNDS {
-        let request = Request::get("/apis/muster.dev/v1alpha1/nodes").body(Vec::new()).expect("a request");
+        let request =
+            Request::get("/apis/muster.dev/v1alpha1/nodes").body(Vec::new()).expect("a request");
         let begin = Instant::now();
         let text = client.request_text(request).await.expect("a list");
         ours.push(begin.elapsed());
@@ -45,7 +46,12 @@ pub(crate) async fn fill(cluster: &Cluster, nodes: usize) {
             let path = "/apis/muster.dev/v1alpha1/nodes";
             let send = |request: http::request::Builder, body: Value| {
                 let body = serde_json::to_vec(&body).expect("JSON");
-                client.request::<Value>(request.header("content-type", "application/json").body(body).expect("a request"))
+                client.request::<Value>(
+                    request
+                        .header("content-type", "application/json")
+                        .body(body)
+                        .expect("a request"),
+                )
             };
             let mut node = json!({
                 "apiVersion": muster_api::API_VERSION, "kind": "Node",

@@ -19,11 +19,21 @@ type Figure = (&'static str, &'static str, fn() -> std::pin::Pin<Box<dyn Future<
 const FIGURES: &[Figure] = &[
     ("store", "durable writes/s at the store, 64 writers", || Box::pin(writes::store())),
     ("rest", "durable writes/s through REST, 64 clients", || Box::pin(writes::rest())),
-    ("placement", "POST to Bound seen by a watch, one task at a time", || Box::pin(placement::one())),
-    ("queue", "2 000 queued tasks on 5 000 hollow nodes until bound and durable", || Box::pin(placement::queue())),
-    ("process", "submit to Running of a process task, against fork+exec", || Box::pin(submit::process())),
-    ("container", "submit to Running of a container, against raw create+start", || Box::pin(submit::container())),
-    ("list", "list of 10 000 nodes, against encoding it and a loopback write", || Box::pin(list::nodes())),
+    ("placement", "POST to Bound seen by a watch, one task at a time", || {
+        Box::pin(placement::one())
+    }),
+    ("queue", "2 000 queued tasks on 5 000 hollow nodes until bound and durable", || {
+        Box::pin(placement::queue())
+    }),
+    ("process", "submit to Running of a process task, against fork+exec", || {
+        Box::pin(submit::process())
+    }),
+    ("container", "submit to Running of a container, against raw create+start", || {
+        Box::pin(submit::container())
+    }),
+    ("list", "list of 10 000 nodes, against encoding it and a loopback write", || {
+        Box::pin(list::nodes())
+    }),
     ("footprint", "RSS and idle CPU of agent and controller", || Box::pin(footprint::all())),
 ];
 

@@ -38,14 +38,23 @@ pub(crate) async fn one() {
             floor.push(rows.commit(1).await);
             let name = format!("p{round}");
             let watch = WatchParams::default().fields(&format!("metadata.name={name}"));
-            let version = api.list_metadata(&kube::api::ListParams::default().limit(1)).await.expect("a list").metadata.resource_version;
-            let mut events = api.watch(&watch, &version.unwrap_or_default()).await.expect("a watch").boxed();
+            let version = api
+                .list_metadata(&kube::api::ListParams::default().limit(1))
+                .await
+                .expect("a list")
+                .metadata
+                .resource_version;
+            let mut events =
+                api.watch(&watch, &version.unwrap_or_default()).await.expect("a watch").boxed();
             let body: Task = serde_json::from_value(task(&name)).expect("a task");
             let begin = Instant::now();
             let created = api.create(&PostParams::default(), &body);
             let seen = async {
                 while let Some(event) = events.next().await {
-                    let (Ok(WatchEvent::Added(task)) | Ok(WatchEvent::Modified(task))) = event else { continue };
+                    let (Ok(WatchEvent::Added(task)) | Ok(WatchEvent::Modified(task))) = event
+                    else {
+                        continue;
+                    };
                     if task.status.is_some_and(|s| s.phase != TaskPhase::Pending) {
                         return begin.elapsed();
                     }

@@ -70,7 +70,12 @@ pub(crate) async fn process() {
         }
         floor.line("floor: fork + exec");
         ours.line("submit to Running seen by a watch");
-        figure("p50 over the floor", millis(ours.median()) - millis(floor.median()), " ms", "<= +15 ms");
+        figure(
+            "p50 over the floor",
+            millis(ours.median()) - millis(floor.median()),
+            " ms",
+            "<= +15 ms",
+        );
     })
     .await;
 }
@@ -104,7 +109,10 @@ async fn raw(engine: &Docker, network: &str) -> Duration {
     let body = ContainerCreateBody {
         image: Some(docker::IMAGE.to_owned()),
         cmd: Some(vec!["sleep".to_owned(), "1000".to_owned()]),
-        host_config: Some(HostConfig { network_mode: Some(network.to_owned()), ..HostConfig::default() }),
+        host_config: Some(HostConfig {
+            network_mode: Some(network.to_owned()),
+            ..HostConfig::default()
+        }),
         ..ContainerCreateBody::default()
     };
     let begin = Instant::now();

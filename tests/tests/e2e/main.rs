@@ -1,5 +1,6 @@
 //! The main job with real processes, cgroups, SQLite and Docker.
 
+mod cli;
 mod figure4;
 mod lease;
 mod quotas;

@@ -1,0 +1,37 @@
+//! What the controller wants of one task, reduced to what decisions depend on.
+
+use serde::{Deserialize, Serialize};
+
+/// When a task whose main process ended starts again.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub enum RestartPolicy {
+    /// Never: its first end is its end.
+    Never,
+    /// After a failure.
+    OnFailure,
+    /// After every end.
+    Always,
+}
+
+/// The controller's order to end a task.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct StopOrder {
+    /// Time between SIGTERM and SIGKILL, milliseconds.
+    pub grace_ms: u64,
+    /// Why, for people (`Deleted`, `Preempted` …).
+    pub reason: String,
+}
+
+/// What the controller wants of one task.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Desired {
+    /// When to start it again.
+    pub restart: RestartPolicy,
+    /// Its own grace period, used when it is ended without an order (milliseconds).
+    pub grace_ms: u64,
+    /// Present: it may run only while the controller was in contact within this time
+    /// (`onDisconnect: Stop`), milliseconds.
+    pub stop_after_ms: Option<u64>,
+    /// Present: it must end.
+    pub stop: Option<StopOrder>,
+}

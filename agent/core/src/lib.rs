@@ -1,0 +1,26 @@
+//! The agent's decisions, without the agent: no runtime, no files, no clock, no randomness. Time is an
+//! argument; what came of an effect comes back as an event.
+//!
+//! | module | holds |
+//! |---|---|
+//! | [`desired`] | what the controller wants of a task, as far as decisions need it |
+//! | [`observed`] | what a runtime saw of an attempt |
+//! | [`event`] | what goes into a decision, and what comes out of it |
+//! | [`workload`] | one task's state machine: `Event` in, `Response` out |
+//! | [`restart`] | when an ended task starts again, and after how long |
+//! | [`report`] | what is told to the controller, and its sequence |
+//! | [`plan`] | a set of assignments against the tasks that are known: who gets which event |
+//!
+//! The executor (`muster-agent`'s `driver`) keeps three promises that the proofs here rest on:
+//! effects are carried out in order; a `Persist` is durable before the effect after it begins; a
+//! runtime's answer is given back as an event exactly once per effect, in any order.
+#![deny(missing_docs)]
+
+pub mod desired;
+pub mod event;
+pub mod observed;
+pub mod plan;
+pub mod report;
+pub mod restart;
+pub mod time;
+pub mod workload;

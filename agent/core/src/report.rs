@@ -1,0 +1,173 @@
+//! What is told to the controller about a task. A report is the whole state, never a difference, so
+//! that the newest one alone matters; its sequence says which is the newest.
+
+use std::fmt;
+
+use serde::{Deserialize, Serialize};
+
+use crate::observed::{End, Exit, Loss};
+use crate::time::Wall;
+
+/// Where a task is on this node.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub enum Phase {
+    /// Accepted; being made ready, or waiting to be started again.
+    Starting,
+    /// Its main process runs.
+    Running,
+    /// It is being ended.
+    Stopping,
+    /// It ended well; nothing of it is left.
+    Succeeded,
+    /// It ended otherwise; nothing of it is left.
+    Failed,
+}
+
+impl Phase {
+    /// Whether the task has ended for good.
+    #[must_use]
+    pub const fn is_terminal(self) -> bool {
+        matches!(self, Phase::Succeeded | Phase::Failed)
+    }
+}
+
+/// Why a task is where it is: one CamelCase word on the wire.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub enum Reason {
+    /// Nothing to explain.
+    None,
+    /// The program returned 0.
+    Completed,
+    /// The program failed.
+    Error,
+    /// The kernel killed it for memory.
+    OomKilled,
+    /// The program could not be started.
+    StartError,
+    /// It was ended by order.
+    Stopped,
+    /// It was ended because contact was lost for too long.
+    Disconnected,
+    /// Its shim was killed, so that nobody knows its status.
+    ShimLost,
+    /// The machine was started anew while it ran.
+    NodeRebooted,
+    /// Its container was removed by somebody else.
+    ContainerLost,
+    /// It waits before it is started again.
+    BackOff,
+    /// It waits for contact with the controller (`onDisconnect: Stop`).
+    AwaitingContact,
+    /// A runtime's own word (`ImagePullFailed`, `QuotaNotEnforced` …).
+    Runtime(String),
+}
+
+impl fmt::Display for Reason {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Reason::None => "",
+            Reason::Completed => "Completed",
+            Reason::Error => "Error",
+            Reason::OomKilled => "OOMKilled",
+            Reason::StartError => "StartError",
+            Reason::Stopped => "Stopped",
+            Reason::Disconnected => "Disconnected",
+            Reason::ShimLost => "ShimLost",
+            Reason::NodeRebooted => "NodeRebooted",
+            Reason::ContainerLost => "ContainerLost",
+            Reason::BackOff => "BackOff",
+            Reason::AwaitingContact => "AwaitingContact",
+            Reason::Runtime(word) => word,
+        })
+    }
+}
+
+/// What a report says.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Content {
+    /// Where the task is.
+    pub phase: Phase,
+    /// The attempt this is about; 0 before the first.
+    pub attempt: u32,
+    /// How often it was started again.
+    pub restarts: u32,
+    /// Why.
+    pub reason: Reason,
+    /// For people.
+    pub message: String,
+    /// Of the last ended attempt, as a shell shows it.
+    pub exit_code: Option<i32>,
+    /// That ended the main process.
+    pub signal: Option<i32>,
+    /// When the attempt's program began.
+    pub started_at: Option<Wall>,
+    /// When the attempt's last process was gone.
+    pub finished_at: Option<Wall>,
+}
+
+/// A numbered report.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Report {
+    /// Grows with every change; 1 is the first.
+    pub sequence: u64,
+    /// What it says.
+    pub content: Content,
+}
+
+impl Report {
+    /// The report of a task that was just accepted.
+    #[must_use]
+    pub fn accepted() -> Report {
+        Report {
+            sequence: 1,
+            content: Content {
+                phase: Phase::Starting,
+                attempt: 0,
+                restarts: 0,
+                reason: Reason::None,
+                message: String::new(),
+                exit_code: None,
+                signal: None,
+                started_at: None,
+                finished_at: None,
+            },
+        }
+    }
+
+    /// Takes `content` if it says something new. Returns whether it did.
+    pub fn update(&mut self, content: Content) -> bool {
+        if self.content == content {
+            return false;
+        }
+        self.sequence += 1;
+        self.content = content;
+        true
+    }
+}
+
+/// The reason and the text that an exit gives by itself.
+#[must_use]
+pub fn explain(exit: &Exit) -> (Reason, String) {
+    if exit.disconnected {
+        return (Reason::Disconnected, "ended after too long without the controller".to_owned());
+    }
+    // A child's death for memory that the program survived is no failure of the program.
+    if exit.oom_killed && !exit.succeeded() {
+        return (Reason::OomKilled, "the kernel killed it at its memory limit".to_owned());
+    }
+    match &exit.end {
+        End::Exited(0) => (Reason::Completed, String::new()),
+        End::Exited(code) => (Reason::Error, format!("exited with code {code}")),
+        End::Signaled(signal) => (Reason::Error, format!("ended by signal {signal}")),
+        End::NotStarted { message } => (Reason::StartError, message.clone()),
+        End::Lost(Loss::Shim) => {
+            (Reason::ShimLost, "its shim was killed; what was left of it was ended".to_owned())
+        }
+        End::Lost(Loss::Reboot) => {
+            (Reason::NodeRebooted, "the machine was started anew while it ran".to_owned())
+        }
+        End::Lost(Loss::Container) => {
+            (Reason::ContainerLost, "its container was removed by somebody else".to_owned())
+        }
+    }
+}

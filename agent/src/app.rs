@@ -1,0 +1,336 @@
+//! Starts, joins and ends everything. Nothing else spawns what outlives its caller.
+//!
+//! | task | owns | ends |
+//! |---|---|---|
+//! | main loop | supervisor | on shutdown |
+//! | link | session, the node's face | dropped on shutdown |
+//! | drivers | one task each | when their inbox closes; processes stay |
+
+use std::fs::{self, File};
+use std::os::fd::AsFd;
+use std::os::unix::fs::DirBuilderExt;
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+use std::sync::Arc;
+
+use rustix::fs::FlockOperation;
+use tokio::sync::mpsc;
+use tokio_util::sync::CancellationToken;
+
+use crate::board::Board;
+use crate::capacity;
+use crate::checkpoint::Checkpoint;
+use crate::clock;
+use crate::config::{Args, Config, ConfigError, Identity, Kind};
+use crate::contact::Contact;
+use crate::driver::{Shared, chain};
+use crate::durable::FileError;
+use crate::link::join::{self, Credentials, JoinError};
+use crate::link::session::{Command, Link};
+use crate::link::token::{Token, TokenError};
+use crate::link::{Address, AddressError};
+use crate::node::{Enforced, Facts, Node};
+use crate::runtime::Runtime;
+use crate::runtime::cgroup::Kernel;
+use crate::runtime::cgroup::hierarchy::Version;
+use crate::runtime::docker::{DockerConfig, DockerRuntime};
+use crate::runtime::process::{ProcessConfig, ProcessRuntime, Reexec};
+use crate::supervisor::Supervisor;
+
+/// Why the agent does not run.
+#[derive(Debug, thiserror::Error)]
+pub enum AgentError {
+    /// A setting makes no sense.
+    #[error("the agent's settings are wrong")]
+    Config(#[from] ConfigError),
+    /// A setting is missing.
+    #[error("{0} is missing")]
+    Missing(&'static str),
+    /// `--join` is no address.
+    #[error("--join")]
+    Address(#[from] AddressError),
+    /// `--token` is no token.
+    #[error("--token")]
+    Token(#[from] TokenError),
+    /// The data directory is another node's.
+    #[error("{dir} belongs to the {what} {theirs:?}, not to {ours:?}")]
+    OtherNode {
+        /// The directory.
+        dir: PathBuf,
+        /// `node` or `kind`.
+        what: &'static str,
+        /// Whose it is.
+        theirs: String,
+        /// Who asked.
+        ours: String,
+    },
+    /// Another agent runs on the data directory.
+    #[error("another agent runs on {0}")]
+    InUse(PathBuf),
+    /// The data directory cannot be used.
+    #[error("the data directory cannot be used")]
+    Files(#[from] FileError),
+    /// The controller does not let it in.
+    #[error("this agent has not joined")]
+    Join(#[from] JoinError),
+    /// The system gives no event loop.
+    #[error("failed to start")]
+    Runtime(#[source] std::io::Error),
+}
+
+impl AgentError {
+    /// What to do about it.
+    #[must_use]
+    pub fn hint(&self) -> Option<&'static str> {
+        match self {
+            AgentError::Missing("--token") => {
+                Some("this agent has not joined yet; `muster token create` makes a token")
+            }
+            AgentError::InUse(_) | AgentError::OtherNode { .. } => {
+                Some("give each agent of a machine its own --data-dir")
+            }
+            AgentError::Join(JoinError::Refused { .. } | JoinError::WrongCa(_))
+            | AgentError::Token(_) => Some("`muster token create` makes a new token"),
+            _ => None,
+        }
+    }
+
+    /// 2: the user's settings; 3: the controller says no; 1: anything else.
+    #[must_use]
+    pub fn exit_code(&self) -> u8 {
+        match self {
+            AgentError::Config(_)
+            | AgentError::Missing(_)
+            | AgentError::Address(_)
+            | AgentError::Token(_)
+            | AgentError::OtherNode { .. } => 2,
+            AgentError::Join(_) => 3,
+            AgentError::InUse(_) | AgentError::Files(_) | AgentError::Runtime(_) => 1,
+        }
+    }
+}
+
+/// Runs an agent until a signal ends it. Tasks stay.
+pub fn run(args: Args, reexec: Reexec) -> ExitCode {
+    let done = tokio::runtime::Builder::new_current_thread()
+        .enable_all()
+        // For short file work only; each thread costs memory on a robot.
+        .max_blocking_threads(4)
+        .build()
+        .map_err(AgentError::Runtime)
+        .and_then(|runtime| {
+            runtime.block_on(async {
+                let shutdown = CancellationToken::new();
+                let until = shutdown.clone();
+                tokio::select! {
+                    done = serve(args, reexec, shutdown) => done,
+                    // Cancels `serve` by its token, so that it ends in order.
+                    () = signalled(until) => Ok(()),
+                }
+            })
+        });
+    match done {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("error: {}", chain(&error));
+            if let Some(hint) = error.hint() {
+                eprintln!("hint: {hint}");
+            }
+            ExitCode::from(error.exit_code())
+        }
+    }
+}
+
+/// Never resolves: it cancels, and lets `serve` be the one that ends.
+async fn signalled(shutdown: CancellationToken) {
+    use tokio::signal::unix::{SignalKind, signal};
+    let (Ok(mut term), Ok(mut int)) =
+        (signal(SignalKind::terminate()), signal(SignalKind::interrupt()))
+    else {
+        return std::future::pending().await;
+    };
+    tokio::select! {
+        _ = term.recv() => {}
+        _ = int.recv() => {}
+    }
+    shutdown.cancel();
+    std::future::pending().await
+}
+
+/// Runs an agent until `shutdown`. Tasks stay.
+///
+/// # Errors
+///
+/// When it cannot start; once it runs, it runs.
+pub async fn serve(
+    args: Args,
+    reexec: Reexec,
+    shutdown: CancellationToken,
+) -> Result<(), AgentError> {
+    let config = args.resolve()?;
+    make_data_dir(&config.data_dir)?;
+    let _lock = lock(&config.data_dir)?;
+    let mut identity = Identity::open(&config.data_dir)?;
+    let (kind, address) = settle(&config, &mut identity)?;
+    let Some(name) = identity.node.clone() else { return Err(AgentError::Missing("--name")) };
+    let credentials = Credentials::at(&config.data_dir);
+    if !credentials.exist() {
+        let token: Token =
+            config.token.as_deref().ok_or(AgentError::Missing("--token"))?.parse()?;
+        join::join(&address, &token, &name, kind, &credentials).await?;
+        tracing::info!(node = %name, controller = %address, "joined");
+    }
+    // Only now: a join that failed must not tie the directory to a name.
+    identity.write(&config.data_dir)?;
+
+    let enforcer = enforcer(&identity.id).await;
+    let enforced = match &enforcer {
+        Ok(kernel) => Ok(Enforced {
+            version: match kernel.hierarchy().version() {
+                Version::V1 => 1,
+                Version::V2 => 2,
+            },
+        }),
+        Err(why) => Err(why.clone()),
+    };
+    let capacity = capacity::detect(config.cpu, config.memory);
+    let checkpoint = Checkpoint::open(&config.data_dir)?;
+    let records = checkpoint.read_all()?;
+    let contact_file = config.data_dir.join("contact");
+    let boot_id = clock::boot_id();
+    let process = ProcessRuntime::new(
+        ProcessConfig {
+            tasks: checkpoint.tasks().to_owned(),
+            reexec: reexec.clone(),
+            contact: contact_file.clone(),
+            log: config.log,
+            unenforced: config.unenforced_quotas,
+        },
+        enforcer,
+    );
+    let docker = DockerRuntime::new(DockerConfig {
+        socket: config.docker_socket.clone(),
+        identity: identity.id.clone(),
+        tasks: checkpoint.tasks().to_owned(),
+        reexec: reexec.clone(),
+        contact: contact_file.clone(),
+    });
+    let (sweeper, retiree) = (process.clone(), process.clone());
+    if let Err(error) = tokio::task::spawn_blocking(move || sweeper.sweep()).await {
+        tracing::error!(%error, "leftovers were not swept");
+    }
+    let shared = Arc::new(Shared {
+        node: name,
+        contact: Contact::open(&contact_file, &boot_id)?,
+        boot_id,
+        checkpoint,
+        board: Board::default(),
+        process: Arc::new(process) as Arc<dyn Runtime>,
+        docker: Arc::new(docker.clone()) as Arc<dyn Runtime>,
+        allocatable_memory: capacity.allocatable.memory.0,
+    });
+    let facts = Facts { kind, capacity, enforced, address: host_name() };
+    let node = Node::new(&config, facts, Arc::clone(&shared));
+    let mut supervisor = Supervisor::new(Arc::clone(&shared));
+    tracing::info!(node = %shared.node, tasks = records.len(), "started");
+    supervisor.restore(records);
+
+    let (commands, mut received) = mpsc::channel(16);
+    let link = Link {
+        address,
+        tls: Arc::new(credentials.tls()?),
+        incarnation: uuid::Uuid::new_v4().to_string(),
+        shared,
+        commands,
+    };
+    let engine = tokio::spawn(async move { docker.run().await });
+    let session = tokio::spawn(link.run(node));
+    loop {
+        // Cancel-safe: receivers, a join and a token.
+        tokio::select! {
+            () = shutdown.cancelled() => break,
+            command = received.recv() => match command {
+                Some(Command::Assign(assignments)) => supervisor.assign(assignments),
+                Some(Command::Contact) => supervisor.tick(),
+                // The link never ends by itself: it panicked. The tasks go on without it.
+                None => {
+                    tracing::error!("the link is gone; start this agent again");
+                    shutdown.cancelled().await;
+                    break;
+                }
+            },
+            () = supervisor.ended() => {}
+        }
+    }
+    session.abort();
+    engine.abort();
+    let _ = (session.await, engine.await);
+    supervisor.shut_down().await;
+    retiree.retire();
+    tracing::info!("the agent ends; its tasks stay");
+    Ok(())
+}
+
+fn make_data_dir(dir: &Path) -> Result<(), FileError> {
+    // Passable, not listable: tasks of other users have their work directories in it.
+    fs::DirBuilder::new()
+        .recursive(true)
+        .mode(0o711)
+        .create(dir)
+        .map_err(FileError::at("make", dir))
+}
+
+fn lock(dir: &Path) -> Result<File, AgentError> {
+    let path = dir.join("lock");
+    let file = File::create(&path).map_err(FileError::at("open", &path))?;
+    match rustix::fs::flock(file.as_fd(), FlockOperation::NonBlockingLockExclusive) {
+        Ok(()) => Ok(file),
+        Err(rustix::io::Errno::WOULDBLOCK) => Err(AgentError::InUse(dir.to_owned())),
+        Err(errno) => Err(FileError::at("lock", &path)(errno.into()).into()),
+    }
+}
+
+/// Settings against what the directory says; what is new goes into the identity.
+fn settle(config: &Config, identity: &mut Identity) -> Result<(Kind, Address), AgentError> {
+    let other = |what, theirs: &str, ours: &str| AgentError::OtherNode {
+        dir: config.data_dir.clone(),
+        what,
+        theirs: theirs.to_owned(),
+        ours: ours.to_owned(),
+    };
+    let name = config.name.as_ref().map(|name| name.as_str().to_owned());
+    match (&identity.node, name) {
+        (Some(theirs), Some(ours)) if *theirs != ours => return Err(other("node", theirs, &ours)),
+        (None, None) => return Err(AgentError::Missing("--name")),
+        (None, name) => identity.node = name,
+        (Some(_), _) => {}
+    }
+    let kind = match (identity.kind, config.kind) {
+        (Some(theirs), Some(ours)) if theirs != ours => {
+            let text = |kind| if kind == Kind::Robot { "robot" } else { "cloud" };
+            return Err(other("kind", text(theirs), text(ours)));
+        }
+        (None, None) => return Err(AgentError::Missing("--kind")),
+        (Some(kind), _) | (None, Some(kind)) => kind,
+    };
+    identity.kind = Some(kind);
+    // The controller may have moved: the newest address counts.
+    let address = config.join.clone().or_else(|| identity.controller.clone());
+    let address = address.ok_or(AgentError::Missing("--join"))?;
+    let parsed = address.parse()?;
+    identity.controller = Some(address);
+    Ok((kind, parsed))
+}
+
+async fn enforcer(id: &str) -> Result<Kernel, String> {
+    let id = id.to_owned();
+    match tokio::task::spawn_blocking(move || Kernel::open(&id)).await {
+        Ok(Ok(kernel)) => Ok(kernel),
+        Ok(Err(error)) => Err(chain(&error)),
+        Err(error) => Err(error.to_string()),
+    }
+}
+
+fn host_name() -> String {
+    rustix::system::uname().nodename().to_string_lossy().into_owned()
+}

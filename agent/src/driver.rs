@@ -1,0 +1,458 @@
+//! One task's driver: carries out what the core decides, in order, and brings back what came of it.
+//!
+//! | source of events | cancel-safe because |
+//! |---|---|
+//! | inbox (from the supervisor) | an mpsc receiver |
+//! | runtime operations under way | futures owned by the driver, polled in place |
+//! | the next wake-up | a sleep; the deadline itself is kept |
+//!
+//! A driver ends when its task is dropped, or when the inbox closes: the agent is going down, and
+//! the task's processes stay.
+
+use std::collections::BTreeSet;
+use std::sync::Arc;
+use std::time::Duration;
+
+use futures::future::{AbortHandle, Abortable, BoxFuture, FutureExt};
+use futures::stream::{FuturesUnordered, StreamExt};
+use muster_agent_core::desired::Desired;
+use muster_agent_core::time::Boot;
+use muster_agent_core::workload::{Context, Effect, Event, Outcome, Response, Workload};
+use muster_api::id::TaskUid;
+use tokio::sync::mpsc;
+
+use crate::board::Board;
+use crate::checkpoint::{Assignment, Checkpoint, Record};
+use crate::clock;
+use crate::contact::Contact;
+use crate::durable::FileError;
+use crate::runtime::{AttemptId, Launch, Launched, Runtime};
+use crate::spec::{self, Kind, Surroundings};
+
+/// Between two tries to make a record durable. Nothing else of the task happens meanwhile: a disk
+/// that is full must not lead to a second run.
+const WRITE_AGAIN: Duration = Duration::from_secs(1);
+
+/// What every driver uses.
+#[derive(Debug)]
+pub(crate) struct Shared {
+    pub(crate) node: String,
+    pub(crate) boot_id: String,
+    pub(crate) checkpoint: Checkpoint,
+    pub(crate) board: Board,
+    pub(crate) contact: Contact,
+    pub(crate) process: Arc<dyn Runtime>,
+    pub(crate) docker: Arc<dyn Runtime>,
+    /// Memory that tasks may reserve, bytes.
+    pub(crate) allocatable_memory: u64,
+}
+
+/// What the supervisor tells a driver.
+#[derive(Debug)]
+pub(crate) enum Message {
+    /// The controller's present wish.
+    Assigned(Box<Assignment>, Desired),
+    /// Anything else.
+    Event(Event),
+}
+
+type Operation = BoxFuture<'static, Option<Event>>;
+
+/// One task.
+pub(crate) struct Driver {
+    shared: Arc<Shared>,
+    runtime: Arc<dyn Runtime>,
+    record: Record,
+    inbox: mpsc::UnboundedReceiver<Message>,
+    operations: FuturesUnordered<Operation>,
+    wakes: BTreeSet<Boot>,
+    prepare: Option<AbortHandle>,
+    dropped: bool,
+}
+
+/// How a driver begins.
+#[derive(Debug)]
+pub(crate) enum Begin {
+    /// A task that was just assigned.
+    New(TaskUid, Box<Assignment>, Desired),
+    /// A task of an earlier life of the agent.
+    Restored(Box<Record>),
+}
+
+pub(crate) async fn drive(
+    shared: Arc<Shared>,
+    begin: Begin,
+    inbox: mpsc::UnboundedReceiver<Message>,
+) {
+    let context = context(&shared);
+    let (record, response) = match begin {
+        Begin::New(uid, assignment, desired) => {
+            let prepare = Kind::of(&assignment.spec) == Kind::Docker;
+            let (workload, response) = Workload::assigned(uid, desired, prepare, context);
+            let boot_id = shared.boot_id.clone();
+            (Record { boot_id, assignment: *assignment, workload }, response)
+        }
+        Begin::Restored(record) => {
+            let mut record = *record;
+            let same_boot = record.boot_id == shared.boot_id;
+            record.boot_id.clone_from(&shared.boot_id);
+            let response = record.workload.restored(same_boot, context);
+            (record, response)
+        }
+    };
+    let runtime = match Kind::of(&record.assignment.spec) {
+        Kind::Process => Arc::clone(&shared.process),
+        Kind::Docker => Arc::clone(&shared.docker),
+    };
+    let mut driver = Driver {
+        shared,
+        runtime,
+        record,
+        inbox,
+        operations: FuturesUnordered::new(),
+        wakes: BTreeSet::new(),
+        prepare: None,
+        dropped: false,
+    };
+    driver.carry_out(response).await;
+    driver.run().await;
+}
+
+fn context(shared: &Shared) -> Context {
+    Context { now: clock::now(), contact: shared.contact.last() }
+}
+
+impl Driver {
+    async fn run(&mut self) {
+        while !self.dropped {
+            let wake = self.wakes.first().copied();
+            let event = tokio::select! {
+                message = self.inbox.recv() => match message {
+                    None => return,
+                    Some(Message::Event(event)) => Some(event),
+                    Some(Message::Assigned(assignment, desired)) => {
+                        self.record.assignment = *assignment;
+                        Some(Event::Assigned(desired))
+                    }
+                },
+                Some(event) = self.operations.next() => event,
+                () = sleep_until(wake) => {
+                    let now = clock::boot();
+                    self.wakes.retain(|wake| *wake > now);
+                    Some(Event::Tick)
+                }
+            };
+            let Some(event) = event else { continue };
+            let id = self.id();
+            tracing::debug!(%id, ?event, state = ?self.record.workload.state, "event");
+            let context = context(&self.shared);
+            let response = self.record.workload.handle(event, context);
+            self.carry_out(response).await;
+        }
+    }
+
+    fn id(&self) -> AttemptId {
+        let workload = &self.record.workload;
+        AttemptId { uid: workload.uid.clone(), attempt: workload.attempt }
+    }
+
+    async fn carry_out(&mut self, response: Response) {
+        for effect in response.effects {
+            match effect {
+                Effect::Persist => self.persist().await,
+                Effect::Publish => self.publish(),
+                Effect::WakeAt(at) => {
+                    self.wakes.insert(at);
+                }
+                Effect::CancelPrepare => {
+                    if let Some(prepare) = self.prepare.take() {
+                        prepare.abort();
+                    }
+                }
+                Effect::Drop => self.drop_task().await,
+                Effect::Prepare(attempt) => {
+                    let (handle, registration) = AbortHandle::new_pair();
+                    self.prepare = Some(handle);
+                    let operation = self.operation(effect);
+                    let operation = Abortable::new(operation, registration);
+                    let event = async move { operation.await.ok().flatten() };
+                    tracing::debug!(attempt, "prepare");
+                    self.operations.push(event.boxed());
+                }
+                Effect::Launch(_)
+                | Effect::Watch(_)
+                | Effect::Find(_)
+                | Effect::Stop { .. }
+                | Effect::Remove => {
+                    let operation = self.operation(effect);
+                    self.operations.push(operation);
+                }
+            }
+        }
+    }
+
+    /// The future of an effect that asks a runtime; its output is the answer.
+    fn operation(&self, effect: Effect) -> Operation {
+        let runtime = Arc::clone(&self.runtime);
+        let launch = self.launch();
+        let attempt = launch.id.attempt;
+        let answer = move |outcome| Some(Event::Attempt(attempt, outcome));
+        match effect {
+            Effect::Prepare(_) => async move {
+                answer(match runtime.prepare(&launch).await {
+                    Ok(()) => Outcome::Prepared,
+                    Err(failure) => Outcome::PrepareFailed(failure),
+                })
+            }
+            .boxed(),
+            Effect::Launch(_) => async move {
+                answer(match runtime.launch(&launch).await {
+                    Launched::Running(started) => Outcome::Launched(started),
+                    Launched::Ended(exit) => Outcome::Exited(exit),
+                    Launched::Refused(failure) => Outcome::LaunchFailed(failure),
+                    Launched::Unclear(error) => {
+                        tracing::warn!(id = %launch.id, error = chain(&error), "launch unclear");
+                        Outcome::LaunchUnclear
+                    }
+                })
+            }
+            .boxed(),
+            Effect::Watch(_) => {
+                async move { answer(Outcome::Exited(runtime.wait(&launch).await)) }.boxed()
+            }
+            Effect::Find(_) => async move {
+                answer(match runtime.find(&launch).await {
+                    Ok(observed) => Outcome::Found(observed),
+                    Err(error) => {
+                        tracing::warn!(id = %launch.id, error = chain(&error), "not found out");
+                        Outcome::FindFailed
+                    }
+                })
+            }
+            .boxed(),
+            Effect::Stop { grace_ms, .. } => async move {
+                let grace = Duration::from_millis(grace_ms);
+                let error = runtime.stop(&launch.id, grace).await.err()?;
+                tracing::warn!(id = %launch.id, error = chain(&error), "not stopped");
+                answer(Outcome::StopFailed)
+            }
+            .boxed(),
+            Effect::Remove => {
+                self.shared.board.withdraw(&launch.id.uid);
+                async move {
+                    let error = match runtime.remove(&launch.id.uid).await {
+                        Ok(()) => return Some(Event::Removed),
+                        Err(error) => error,
+                    };
+                    tracing::warn!(id = %launch.id, error = chain(&error), "not removed");
+                    Some(Event::RemoveFailed)
+                }
+                .boxed()
+            }
+            Effect::Persist
+            | Effect::Publish
+            | Effect::CancelPrepare
+            | Effect::WakeAt(_)
+            | Effect::Drop => futures::future::ready(None).boxed(),
+        }
+    }
+
+    fn launch(&self) -> Launch {
+        let reserved = self.record.assignment.spec.resources.memory.map_or(0, |memory| memory.0);
+        let task_dir = self.shared.checkpoint.task_dir(&self.record.workload.uid);
+        let others = self.shared.board.reserved().saturating_sub(reserved);
+        let around = Surroundings {
+            node: &self.shared.node,
+            task_dir: &task_dir,
+            unreserved: self.shared.allocatable_memory.saturating_sub(others),
+        };
+        spec::launch(self.id(), &self.record.assignment, &around)
+    }
+
+    fn publish(&self) {
+        let workload = &self.record.workload;
+        let reserved = self.record.assignment.spec.resources.memory.map_or(0, |memory| memory.0);
+        let board = &self.shared.board;
+        board.publish(&workload.uid, &workload.report, workload.attempt, &self.runtime, reserved);
+    }
+
+    async fn persist(&mut self) {
+        loop {
+            let (shared, record) = (Arc::clone(&self.shared), self.record.clone());
+            let write = move || shared.checkpoint.write(&record);
+            let Some(error) = blocking(write).await else { return };
+            tracing::error!(id = %self.id(), error = chain(&error), "the task waits for its disk");
+            tokio::time::sleep(WRITE_AGAIN).await;
+        }
+    }
+
+    async fn drop_task(&mut self) {
+        let (shared, uid) = (Arc::clone(&self.shared), self.record.workload.uid.clone());
+        if let Some(error) = blocking(move || shared.checkpoint.drop_task(&uid)).await {
+            // Without its record it is swept at the next start; with it, it is removed then.
+            tracing::warn!(id = %self.id(), error = chain(&error), "the task's files stay behind");
+        }
+        self.dropped = true;
+    }
+}
+
+async fn blocking<F>(work: F) -> Option<FileError>
+where
+    F: FnOnce() -> Result<(), FileError> + Send + 'static,
+{
+    match tokio::task::spawn_blocking(work).await {
+        Ok(done) => done.err(),
+        Err(error) => Some(FileError {
+            action: "finish the work on",
+            path: std::path::PathBuf::new(),
+            source: std::io::Error::other(error),
+        }),
+    }
+}
+
+async fn sleep_until(wake: Option<Boot>) {
+    match wake {
+        Some(wake) => {
+            let left = wake.0.saturating_sub(clock::boot().0);
+            tokio::time::sleep(Duration::from_millis(left)).await;
+        }
+        None => std::future::pending().await,
+    }
+}
+
+/// An error and its causes, for one line of a log or one message to a person.
+pub(crate) fn chain(error: &dyn std::error::Error) -> String {
+    let mut text = error.to_string();
+    let mut cause = error.source();
+    while let Some(source) = cause {
+        text.push_str(": ");
+        text.push_str(&source.to_string());
+        cause = source.source();
+    }
+    text
+}
+
+#[cfg(test)]
+mod tests {
+    use muster_agent_core::observed::{End, Exit, Observed, Started};
+    use muster_agent_core::report::{Phase, Reason, Report};
+    use muster_agent_core::time::Wall;
+    use muster_agent_core::workload::Failure;
+    use muster_api::wire::agent_session::spec_from_wire;
+    use tokio::task::JoinHandle;
+
+    use super::*;
+    use crate::runtime::fake::Fake;
+
+    struct Bench {
+        dir: tempfile::TempDir,
+        fake: Arc<Fake>,
+        shared: Arc<Shared>,
+        inbox: mpsc::UnboundedSender<Message>,
+        driver: JoinHandle<()>,
+    }
+
+    fn shared(dir: &tempfile::TempDir, fake: &Arc<Fake>) -> Arc<Shared> {
+        let checkpoint = Checkpoint::open(dir.path()).unwrap();
+        Arc::new(Shared {
+            node: "n".to_owned(),
+            boot_id: "b".to_owned(),
+            checkpoint,
+            board: Board::default(),
+            contact: Contact::open(&dir.path().join("contact"), "b").unwrap(),
+            process: Arc::clone(fake) as Arc<dyn Runtime>,
+            docker: Arc::clone(fake) as Arc<dyn Runtime>,
+            allocatable_memory: 1 << 30,
+        })
+    }
+
+    fn begin() -> Begin {
+        let json = br#"{"run":{"process":{"command":["x"]}},"restartPolicy":"OnFailure"}"#;
+        let task_spec = spec_from_wire(json).unwrap();
+        let desired = spec::desired(&task_spec, None);
+        let assignment = Assignment {
+            namespace: "default".to_owned(),
+            name: "t".to_owned(),
+            spec: task_spec,
+            lease: None,
+        };
+        Begin::New(TaskUid::new("t"), Box::new(assignment), desired)
+    }
+
+    fn bench(dir: tempfile::TempDir, fake: Arc<Fake>, begin: Begin) -> Bench {
+        let shared = shared(&dir, &fake);
+        let (inbox, messages) = mpsc::unbounded_channel();
+        let driver = tokio::spawn(drive(Arc::clone(&shared), begin, messages));
+        Bench { dir, fake, shared, inbox, driver }
+    }
+
+    impl Bench {
+        async fn report(&self, wanted: impl Fn(&Report) -> bool) -> Report {
+            loop {
+                let reports = self.shared.board.reports();
+                if let Some((_, report, _)) = reports.into_iter().find(|(_, r, _)| wanted(r)) {
+                    return report;
+                }
+                self.shared.board.changed().await;
+            }
+        }
+    }
+
+    fn exit(code: i32) -> Exit {
+        Exit {
+            end: End::Exited(code),
+            oom_killed: false,
+            disconnected: false,
+            started_at: Some(Wall(1)),
+            finished_at: Wall(2),
+        }
+    }
+
+    #[tokio::test]
+    async fn a_failure_waits_and_another_life_goes_on_with_the_same_attempt() {
+        let dir = tempfile::tempdir().unwrap();
+        let fake = Arc::new(Fake::default());
+        let refused =
+            Failure { reason: "NodeError".to_owned(), message: "no".to_owned(), retry: true };
+        fake.launches
+            .lock()
+            .unwrap()
+            .extend([Launched::Refused(refused), Launched::Running(Started { at: Wall(1) })]);
+        let bench = bench(dir, fake, begin());
+        let waits = bench.report(|r| r.content.reason != Reason::None).await;
+        assert_eq!(waits.content.reason, Reason::Runtime("NodeError".to_owned()));
+        bench.report(|r| r.content.phase == Phase::Running).await;
+        // It is told before it is watched.
+        while bench.fake.asked().len() < 3 {
+            tokio::task::yield_now().await;
+        }
+        assert_eq!(bench.fake.asked(), ["launch 1", "launch 1", "wait 1"]);
+
+        // The agent dies, and the program ends meanwhile.
+        bench.driver.abort();
+        let Bench { dir, .. } = bench;
+        let fake = Arc::new(Fake::default());
+        fake.finds.lock().unwrap().push_back(Observed::Ended(exit(0)));
+        let record = Checkpoint::open(dir.path()).unwrap().read_all().unwrap().remove(0);
+        let bench = super::tests::bench(dir, fake, Begin::Restored(Box::new(record)));
+        let end = bench.report(|r| r.content.phase.is_terminal()).await;
+        assert_eq!((end.content.phase, end.content.attempt), (Phase::Succeeded, 1));
+        assert_eq!(bench.fake.asked(), ["find 1"]);
+    }
+
+    #[tokio::test]
+    async fn a_forgotten_task_is_stopped_removed_and_dropped() {
+        let fake = Arc::new(Fake::default());
+        let running = Launched::Running(Started { at: Wall(1) });
+        fake.launches.lock().unwrap().push_back(running);
+        let bench = bench(tempfile::tempdir().unwrap(), fake, begin());
+        bench.report(|r| r.content.phase == Phase::Running).await;
+        bench.inbox.send(Message::Event(Event::Forgotten)).unwrap();
+        bench.report(|r| r.content.phase == Phase::Stopping).await;
+        bench.fake.exit(exit(0));
+        bench.driver.await.unwrap();
+        assert_eq!(bench.fake.asked(), ["launch 1", "wait 1", "stop 1", "remove"]);
+        assert!(!bench.dir.path().join("tasks/t").exists());
+        assert!(bench.shared.board.reports().is_empty());
+    }
+}

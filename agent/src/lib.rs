@@ -1,0 +1,39 @@
+//! The agent: runs tasks on a robot or a cloud server, held to their quotas.
+//!
+//! ```text
+//! controller ⇄ link ──▶ supervisor ──▶ driver (one a task) ──▶ runtime ──▶ shim ──▶ program
+//!                │                        │   core decides          └──▶ Docker Engine
+//!                └──── board ◀────────────┘   checkpoint remembers
+//! ```
+//!
+//! | module | holds |
+//! |---|---|
+//! | `config` | flags and `agent.yaml` |
+//! | `app` | starts, joins and ends everything |
+//! | `supervisor`, `driver` | what `muster-agent-core` decides, carried out |
+//! | `checkpoint`, `durable` | what survives the agent |
+//! | `board` | what tasks show of themselves |
+//! | `contact` | when the controller was last heard, for the shims too |
+//! | `link` | joining, the session, logs on request |
+//! | `node`, `capacity`, `position` | what this node is, has, and where it is |
+//! | `runtime`, `shim` | what runs tasks |
+
+mod app;
+mod board;
+mod capacity;
+mod checkpoint;
+mod clock;
+pub mod config;
+mod contact;
+mod driver;
+mod durable;
+mod link;
+mod node;
+mod position;
+mod runtime;
+pub mod shim;
+mod spec;
+mod supervisor;
+
+pub use app::{AgentError, run, serve};
+pub use runtime::process::Reexec;

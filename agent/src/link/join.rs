@@ -1,0 +1,235 @@
+//! From a token to a certificate, once. The key is made here and never leaves.
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::Duration;
+
+use bytes::Bytes;
+use futures::TryFutureExt;
+use http::{Request, StatusCode, header};
+use hyper::body::Body;
+use hyper_util::rt::TokioIo;
+use rcgen::{CertificateParams, DnType, KeyPair};
+use rustls::ClientConfig;
+use serde::{Deserialize, Serialize};
+
+use super::Address;
+use super::tls::{self, ConnectError};
+use super::token::Token;
+use crate::config::Kind;
+use crate::durable::{self, FileError, Keep};
+
+/// An answer to a join is a signature and a row in a table.
+const PATIENCE: Duration = Duration::from_secs(20);
+
+/// An answer holds two certificates, or a status.
+const LONGEST_ANSWER: usize = 256 << 10;
+
+/// Why this agent has not joined.
+#[derive(Debug, thiserror::Error)]
+pub enum JoinError {
+    /// See the source.
+    #[error("failed to join")]
+    Connect(#[from] ConnectError),
+    /// The controller does not answer as one.
+    #[error("the controller did not answer the request to join")]
+    Http(#[source] Box<dyn std::error::Error + Send + Sync>),
+    /// The controller says no.
+    #[error("the controller refuses to let {node} join ({status}): {message}")]
+    Refused {
+        /// Who asked.
+        node: String,
+        /// The HTTP status.
+        status: u16,
+        /// The controller's words.
+        message: String,
+    },
+    /// The controller's certificate is not from the CA that the token names.
+    #[error(
+        "the server at {0} is not the controller that made this token: its CA has another hash"
+    )]
+    WrongCa(String),
+    /// No key could be made.
+    #[error("failed to make a key")]
+    Key(#[source] rcgen::Error),
+    /// Credentials could not be stored.
+    #[error("failed to store the credentials")]
+    Store(#[from] FileError),
+}
+
+/// The files of a joined agent.
+#[derive(Debug, Clone)]
+pub(crate) struct Credentials {
+    dir: PathBuf,
+}
+
+#[derive(Serialize)]
+#[serde(rename_all = "camelCase")]
+struct JoinRequest<'a> {
+    token: &'a str,
+    node_name: &'a str,
+    kind: &'static str,
+    csr: String,
+}
+
+#[derive(Deserialize)]
+struct JoinAnswer {
+    certificate: String,
+    ca: String,
+}
+
+#[derive(Deserialize)]
+struct StatusAnswer {
+    #[serde(default)]
+    message: String,
+}
+
+impl Credentials {
+    pub(crate) fn at(data_dir: &Path) -> Credentials {
+        Credentials { dir: data_dir.join("pki") }
+    }
+
+    /// Whether this agent joined before.
+    pub(crate) fn exist(&self) -> bool {
+        // The certificate is written last.
+        self.dir.join("node.crt").exists()
+    }
+
+    /// The session's TLS.
+    pub(crate) fn tls(&self) -> Result<ClientConfig, JoinError> {
+        let read = |name: &str| {
+            let path = self.dir.join(name);
+            std::fs::read(&path).map_err(FileError::at("read", &path))
+        };
+        Ok(tls::mutual(&read("ca.crt")?, &read("node.crt")?, &read("node.key")?)?)
+    }
+
+    fn write(&self, key: &str, answer: &JoinAnswer) -> Result<(), FileError> {
+        std::fs::create_dir_all(&self.dir).map_err(FileError::at("make", &self.dir))?;
+        for (name, text) in
+            [("node.key", key), ("ca.crt", &answer.ca), ("node.crt", &answer.certificate)]
+        {
+            durable::write(&self.dir.join(name), text.as_bytes(), 0o600, Keep::PowerCut)?;
+        }
+        Ok(())
+    }
+}
+
+/// Joins as `node` and stores what the controller gives.
+pub(crate) async fn join(
+    address: &Address,
+    token: &Token,
+    node: &str,
+    kind: Kind,
+    credentials: &Credentials,
+) -> Result<(), JoinError> {
+    let key = KeyPair::generate().map_err(JoinError::Key)?;
+    let mut params = CertificateParams::default();
+    params.distinguished_name.push(DnType::CommonName, node);
+    let csr = params.serialize_request(&key).and_then(|csr| csr.pem()).map_err(JoinError::Key)?;
+    let kind = match kind {
+        Kind::Robot => "Robot",
+        Kind::Cloud => "Cloud",
+    };
+    let body = serde_json::to_vec(&JoinRequest { token: &token.text, node_name: node, kind, csr })
+        .map_err(|error| JoinError::Http(error.into()))?;
+    let asked = post(address, token, body.into());
+    let (status, body) = match tokio::time::timeout(PATIENCE, asked).await {
+        Ok(answer) => answer?,
+        Err(late) => return Err(JoinError::Http(late.into())),
+    };
+    if !status.is_success() {
+        let message = serde_json::from_slice(&body)
+            .map_or_else(|_| "no reason given".to_owned(), |answer: StatusAnswer| answer.message);
+        return Err(JoinError::Refused { node: node.to_owned(), status: status.as_u16(), message });
+    }
+    let answer: JoinAnswer =
+        serde_json::from_slice(&body).map_err(|error| JoinError::Http(error.into()))?;
+    credentials.write(&key.serialize_pem(), &answer)?;
+    Ok(())
+}
+
+async fn post(
+    address: &Address,
+    token: &Token,
+    body: Bytes,
+) -> Result<(StatusCode, Vec<u8>), JoinError> {
+    let config = Arc::new(tls::by_hash(token.ca_hash)?);
+    let stream = tls::connect(address, config).await.map_err(|error| match &error {
+        ConnectError::Tls { source, .. } if is_unknown_issuer(source) => {
+            JoinError::WrongCa(address.to_string())
+        }
+        _ => JoinError::Connect(error),
+    })?;
+    let http = |error: hyper::Error| JoinError::Http(error.into());
+    let (mut sender, connection) =
+        hyper::client::conn::http1::handshake(TokioIo::new(stream)).await.map_err(http)?;
+    let request = Request::post("/apis/muster.dev/v1alpha1/join")
+        .header(header::HOST, address.to_string())
+        .header(header::CONTENT_TYPE, "application/json")
+        .body(crate::link::join::body::Whole::new(body))
+        .map_err(|error| JoinError::Http(error.into()))?;
+    let ask = async {
+        let response = sender.send_request(request).await.map_err(http)?;
+        let (head, mut body) = response.into_parts();
+        let mut bytes = Vec::new();
+        while let Some(frame) =
+            std::future::poll_fn(|context| std::pin::Pin::new(&mut body).poll_frame(context)).await
+        {
+            if let Ok(data) = frame.map_err(http)?.into_data() {
+                bytes.extend_from_slice(&data);
+            }
+            if bytes.len() > LONGEST_ANSWER {
+                return Err(JoinError::Http("the answer has no end".into()));
+            }
+        }
+        Ok((head.status, bytes))
+    };
+    // The connection has to be driven while the answer is read; it ends with it.
+    tokio::select! {
+        answer = ask => answer,
+        Err(error) = connection.map_err(http) => Err(error),
+    }
+}
+
+fn is_unknown_issuer(error: &std::io::Error) -> bool {
+    let inner = error.get_ref().and_then(|inner| inner.downcast_ref::<rustls::Error>());
+    matches!(
+        inner,
+        Some(rustls::Error::InvalidCertificate(rustls::CertificateError::UnknownIssuer))
+    )
+}
+
+/// A request body that is one piece: all that a join needs of a body crate.
+mod body {
+    use std::convert::Infallible;
+    use std::pin::Pin;
+    use std::task::{Context, Poll};
+
+    use bytes::Bytes;
+    use hyper::body::{Body, Frame, SizeHint};
+
+    pub(super) struct Whole(Option<Bytes>);
+
+    impl Whole {
+        pub(super) fn new(bytes: Bytes) -> Whole {
+            Whole(Some(bytes))
+        }
+    }
+
+    impl Body for Whole {
+        type Data = Bytes;
+        type Error = Infallible;
+
+        fn poll_frame(
+            mut self: Pin<&mut Self>,
+            _: &mut Context<'_>,
+        ) -> Poll<Option<Result<Frame<Bytes>, Infallible>>> {
+            Poll::Ready(self.0.take().map(|bytes| Ok(Frame::data(bytes))))
+        }
+
+        fn size_hint(&self) -> SizeHint {
+            SizeHint::with_exact(self.0.as_ref().map_or(0, Bytes::len) as u64)
+        }
+    }
+}

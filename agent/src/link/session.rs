@@ -1,0 +1,323 @@
+//! One stream per life of the agent, made again whenever it breaks.
+//!
+//! ```text
+//! supervisor ◀── Command ── session ──▶ controller
+//! board ──── reports, usage ──▶ │
+//! node  ──── state, pose ─────▶ │
+//! ```
+//!
+//! Level-triggered: a Hello carries every report and the whole node; what was sent in a session is
+//! sent again until it is acknowledged. Losing a session loses nothing but time.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::time::Duration;
+
+use hyper_util::rt::TokioIo;
+use muster_agent_core::time::Boot;
+use muster_api::wire::agent::v1 as proto;
+use proto::agent_message::Body as Say;
+use proto::controller_message::Body as Hear;
+use rustls::ClientConfig;
+use tokio::sync::mpsc;
+use tokio::task::{AbortHandle, JoinSet};
+use tokio::time::{Instant, MissedTickBehavior};
+use tokio_stream::wrappers::ReceiverStream;
+use tonic::transport::{Channel, Endpoint};
+
+use super::stream_logs::stream_logs;
+use super::{Address, report, tls};
+use crate::clock;
+use crate::driver::{Shared, chain};
+use crate::node::Node;
+
+/// The client's side of the service.
+mod service {
+    #![allow(
+        clippy::all,
+        clippy::allow_attributes,
+        clippy::allow_attributes_without_reason,
+        missing_debug_implementations,
+        unreachable_pub,
+        reason = "generated"
+    )]
+    include!(concat!(env!("OUT_DIR"), "/muster.agent.v1.rs"));
+}
+use service::agent_service_client::AgentServiceClient;
+
+/// First and longest pause between two tries. The first is short, because a controller that is
+/// started anew is back within seconds; the longest bounds how long a robot is alone for nothing.
+const PAUSE: (Duration, Duration) = (Duration::from_millis(50), Duration::from_secs(5));
+
+/// Messages under way to the controller. Short: whoever has much to say (logs) waits here.
+const QUEUE: usize = 32;
+
+/// A report without an answer is said again after this.
+const SAY_AGAIN: Duration = Duration::from_secs(5);
+
+/// A connection on which nothing was heard for this long is given up.
+const DEAF_AFTER: Duration = Duration::from_secs(10);
+
+/// A log request is a reader at a terminal; more than this is a mistake, or an attack.
+const MOST_READERS: usize = 64;
+
+/// What the session tells the supervisor.
+#[derive(Debug)]
+pub(crate) enum Command {
+    Assign(proto::Assignments),
+    /// Contact was made after a time without.
+    Contact,
+}
+
+/// Why a session ended.
+#[derive(Debug, thiserror::Error)]
+enum SessionError {
+    #[error("failed to connect")]
+    Connect(#[source] tonic::transport::Error),
+    #[error("the controller ended the session")]
+    Status(#[source] Box<tonic::Status>),
+    #[error("the controller closed the session")]
+    Closed,
+    #[error("the controller's first message was no welcome")]
+    NoWelcome,
+    #[error("nothing was heard for {} s", DEAF_AFTER.as_secs())]
+    Deaf,
+}
+
+/// What a session needs.
+#[derive(Debug)]
+pub(crate) struct Link {
+    pub(crate) address: Address,
+    pub(crate) tls: Arc<ClientConfig>,
+    /// This life of the agent.
+    pub(crate) incarnation: String,
+    pub(crate) shared: Arc<Shared>,
+    pub(crate) commands: mpsc::Sender<Command>,
+}
+
+pub(crate) fn outgoing(body: Say) -> proto::AgentMessage {
+    proto::AgentMessage { body: Some(body) }
+}
+
+impl Link {
+    /// Keeps a session until it is dropped.
+    pub(crate) async fn run(self, mut node: Node) {
+        let mut pause = PAUSE.0;
+        loop {
+            let begun = Instant::now();
+            if let Err(error) = self.session(&mut node).await {
+                // One line a loss, not one a try.
+                if begun.elapsed() > DEAF_AFTER || pause == PAUSE.0 {
+                    tracing::warn!(error = chain(&error), "not connected to the controller");
+                }
+            }
+            if begun.elapsed() > PAUSE.1 {
+                pause = PAUSE.0;
+            }
+            tokio::time::sleep(pause).await;
+            pause = (pause * 2).min(PAUSE.1);
+        }
+    }
+
+    async fn channel(&self) -> Result<Channel, SessionError> {
+        let endpoint = Endpoint::from_shared(format!("http://{}", self.address))
+            .map_err(SessionError::Connect)?
+            .connect_timeout(DEAF_AFTER)
+            .http2_keep_alive_interval(DEAF_AFTER / 2)
+            .keep_alive_timeout(DEAF_AFTER / 2)
+            .keep_alive_while_idle(true);
+        let (address, tls) = (self.address.clone(), Arc::clone(&self.tls));
+        let connector = tower::service_fn(move |_: http::Uri| {
+            let (address, tls) = (address.clone(), Arc::clone(&tls));
+            async move { tls::connect(&address, tls).await.map(TokioIo::new) }
+        });
+        endpoint.connect_with_connector(connector).await.map_err(SessionError::Connect)
+    }
+
+    async fn session(&self, node: &mut Node) -> Result<(), SessionError> {
+        let mut client = AgentServiceClient::new(self.channel().await?);
+        let (out, queue) = mpsc::channel(QUEUE);
+        let sent = clock::boot();
+        let reports = self.shared.board.reports();
+        let hello = proto::Hello {
+            node: self.shared.node.clone(),
+            incarnation: self.incarnation.clone(),
+            version: env!("CARGO_PKG_VERSION").to_owned(),
+            state: Some(node.state()),
+            tasks: reports.iter().map(|(uid, said, _)| report::to_wire(uid, said)).collect(),
+        };
+        // The queue is empty: this does not wait.
+        let _ = out.send(outgoing(Say::Hello(hello))).await;
+        let status = |status: tonic::Status| SessionError::Status(Box::new(status));
+        let mut heard =
+            client.session(ReceiverStream::new(queue)).await.map_err(status)?.into_inner();
+        let first = tokio::time::timeout(DEAF_AFTER, heard.message());
+        let welcome = match first.await.map_err(|_| SessionError::Deaf)?.map_err(status)? {
+            Some(proto::ControllerMessage { body: Some(Hear::Welcome(welcome)) }) => welcome,
+            Some(_) => return Err(SessionError::NoWelcome),
+            None => return Err(SessionError::Closed),
+        };
+        tracing::info!(controller = %welcome.controller, address = %self.address, "connected");
+        self.shared.contact.made(sent);
+        let _ = self.commands.send(Command::Contact).await;
+        let said = reports
+            .into_iter()
+            .map(|(uid, said, _)| (uid.to_string(), (said.sequence, Instant::now())));
+        let mut session = Session {
+            link: self,
+            node,
+            out,
+            said: said.collect(),
+            beats: BTreeMap::new(),
+            beat: 0,
+            readers: JoinSet::new(),
+            requests: BTreeMap::new(),
+        };
+        let interval =
+            Duration::from_millis(welcome.heartbeat_interval_ms.clamp(50, 60_000).into());
+        session.run(&mut heard, interval).await
+    }
+}
+
+struct Session<'a> {
+    link: &'a Link,
+    node: &'a mut Node,
+    out: mpsc::Sender<proto::AgentMessage>,
+    /// By task: the newest sequence said in this session, and when.
+    said: BTreeMap<String, (u64, Instant)>,
+    /// When heartbeats without an answer were sent.
+    beats: BTreeMap<u64, Boot>,
+    beat: u64,
+    readers: JoinSet<u64>,
+    requests: BTreeMap<u64, AbortHandle>,
+}
+
+impl Session<'_> {
+    async fn run(
+        &mut self,
+        heard: &mut tonic::Streaming<proto::ControllerMessage>,
+        interval: Duration,
+    ) -> Result<(), SessionError> {
+        let mut beats = tokio::time::interval(interval);
+        beats.set_missed_tick_behavior(MissedTickBehavior::Delay);
+        let shared = Arc::clone(&self.link.shared);
+        let mut last_heard = Instant::now();
+        loop {
+            // Every arm is cancel-safe: a stream's next message stays in the stream, a permit that
+            // was stored stays stored, a tick and a join are taken whole or not at all. What an arm
+            // sends, it sends before the next wait.
+            tokio::select! {
+                message = heard.message() => {
+                    last_heard = Instant::now();
+                    match message.map_err(|status| SessionError::Status(Box::new(status)))? {
+                        Some(proto::ControllerMessage { body: Some(body) }) => self.hear(body).await,
+                        Some(_) => tracing::warn!("the controller says something newer than this agent"),
+                        None => return Err(SessionError::Closed),
+                    }
+                }
+                () = shared.board.changed() => self.say_reports().await?,
+                _ = beats.tick() => {
+                    if last_heard.elapsed() > DEAF_AFTER.max(interval * 4) {
+                        return Err(SessionError::Deaf);
+                    }
+                    self.say_heartbeat().await?;
+                    self.say_reports().await?;
+                }
+                Some(done) = self.readers.join_next() => {
+                    if let Ok(id) = done {
+                        self.requests.remove(&id);
+                    }
+                }
+            }
+        }
+    }
+
+    async fn hear(&mut self, body: Hear) {
+        match body {
+            Hear::Welcome(_) => tracing::warn!("a second welcome"),
+            Hear::Assignments(assignments) => {
+                // Closed: the agent is going down, and this session with it.
+                let _ = self.link.commands.send(Command::Assign(assignments)).await;
+            }
+            Hear::Heartbeat(answer) => {
+                if let Some(sent) = self.beats.remove(&answer.sequence) {
+                    self.link.shared.contact.made(sent);
+                }
+                self.beats.retain(|sequence, _| *sequence > answer.sequence);
+            }
+            Hear::Task(answer) => {
+                self.link.shared.board.acknowledged(&answer.uid, answer.sequence);
+            }
+            Hear::Log(request) => self.start_reader(request).await,
+            Hear::LogCancel(cancel) => {
+                if let Some(reader) = self.requests.remove(&cancel.id) {
+                    reader.abort();
+                }
+            }
+        }
+    }
+
+    async fn start_reader(&mut self, request: proto::LogRequest) {
+        let id = request.id;
+        if self.requests.len() >= MOST_READERS {
+            let error = "too many logs are being read from this node".to_owned();
+            let end = proto::LogChunk { id, data: Vec::new(), end: true, error };
+            let _ = self.say(Say::Log(end)).await;
+            return;
+        }
+        let (shared, out) = (Arc::clone(&self.link.shared), self.out.clone());
+        let reader = self.readers.spawn(async move {
+            stream_logs(&shared.board, request, out).await;
+            id
+        });
+        self.requests.insert(id, reader);
+    }
+
+    async fn say_reports(&mut self) -> Result<(), SessionError> {
+        let now = Instant::now();
+        for (uid, report, acked) in self.link.shared.board.reports() {
+            let said = self.said.get(uid.as_str());
+            let fresh = said.is_none_or(|(sequence, _)| report.sequence > *sequence);
+            let unanswered = acked < report.sequence
+                && said.is_some_and(|(_, at)| now.duration_since(*at) >= SAY_AGAIN);
+            if fresh || unanswered {
+                self.said.insert(uid.to_string(), (report.sequence, now));
+                self.say(Say::Task(report::to_wire(&uid, &report))).await?;
+            }
+        }
+        Ok(())
+    }
+
+    async fn say_heartbeat(&mut self) -> Result<(), SessionError> {
+        if let Some(state) = self.node.changed() {
+            self.say(Say::Node(state)).await?;
+        }
+        self.beat += 1;
+        let usage = self.link.shared.board.sample().into_iter();
+        let usage = usage.map(|usage| proto::TaskUsage {
+            uid: usage.uid.to_string(),
+            usage: Some(proto::Usage {
+                cpu_millis: usage.cpu_millis,
+                memory_bytes: usage.used.memory_bytes,
+                cpu_total_usec: usage.used.cpu_usec,
+            }),
+        });
+        let heartbeat = proto::Heartbeat {
+            sequence: self.beat,
+            pose: self.node.moved(),
+            usage: usage.collect(),
+            node: self.node.usage(),
+        };
+        self.beats.insert(self.beat, clock::boot());
+        self.say(Say::Heartbeat(heartbeat)).await
+    }
+
+    async fn say(&self, body: Say) -> Result<(), SessionError> {
+        // A queue that does not move is a connection that is gone.
+        match tokio::time::timeout(DEAF_AFTER, self.out.send(outgoing(body))).await {
+            Ok(Ok(())) => Ok(()),
+            Ok(Err(_)) => Err(SessionError::Closed),
+            Err(_) => Err(SessionError::Deaf),
+        }
+    }
+}

@@ -1,0 +1,27 @@
+//! `muster-agent`: the agent as a program of its own.
+
+use std::process::ExitCode;
+
+use clap::Parser;
+use muster_agent::{Reexec, config, shim};
+use tracing_subscriber::EnvFilter;
+
+/// Runs tasks on this robot or cloud server, held to their quotas.
+#[derive(Debug, Parser)]
+#[command(name = "muster-agent", version)]
+struct Cli {
+    #[command(flatten)]
+    agent: config::Args,
+}
+
+fn main() -> ExitCode {
+    let mut args = std::env::args_os();
+    // Before anything else: a shim must stay small, and it has no use for the rest.
+    if args.nth(1).is_some_and(|verb| verb == shim::VERB) {
+        shim::main(args);
+    }
+    let cli = Cli::parse();
+    let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new("info"));
+    tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).init();
+    muster_agent::run(cli.agent, Reexec::this_binary(&[shim::VERB]))
+}

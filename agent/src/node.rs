@@ -1,0 +1,166 @@
+//! What this node is and has, as the controller is told.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use muster_api::condition::{Condition, ConditionStatus, QUOTAS_ENFORCED};
+use muster_api::kind::node::RuntimeStatus;
+use muster_api::pose::Pose;
+use muster_api::wire::agent::v1 as proto;
+use muster_api::wire::agent_session::NodeReport;
+
+use crate::capacity::{Capacity, Machine};
+use crate::config::{Config, Kind};
+use crate::driver::Shared;
+use crate::position::Position;
+
+/// The node's face. Owned by the link: it alone tells the controller.
+#[derive(Debug)]
+pub(crate) struct Node {
+    shared: Arc<Shared>,
+    fixed: NodeReport,
+    boot_id: String,
+    position: Option<Box<dyn Position>>,
+    machine: Machine,
+    told: Option<proto::NodeState>,
+    told_pose: Option<Pose>,
+}
+
+/// Facts found at the start.
+#[derive(Debug)]
+pub(crate) struct Facts {
+    pub(crate) kind: Kind,
+    pub(crate) capacity: Capacity,
+    /// Or why quotas are not enforced.
+    pub(crate) enforced: Result<Enforced, String>,
+    pub(crate) address: String,
+}
+
+/// How quotas are enforced.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Enforced {
+    pub(crate) version: u8,
+}
+
+impl Node {
+    pub(crate) fn new(config: &Config, facts: Facts, shared: Arc<Shared>) -> Node {
+        let fixed = NodeReport {
+            kind: facts.kind.into(),
+            labels: labels(config),
+            capacity: facts.capacity.capacity,
+            allocatable: facts.capacity.allocatable,
+            sensors: config.sensors.iter().cloned().collect(),
+            actuators: config.actuators.iter().cloned().collect(),
+            pose: None,
+            runtimes: Vec::new(),
+            conditions: conditions(config, facts.enforced),
+            speed: config.speed,
+            address: facts.address,
+        };
+        let position = match facts.kind {
+            Kind::Robot => config.position.as_ref().map(|source| source.open(&config.map)),
+            Kind::Cloud => None,
+        };
+        let boot_id = shared.boot_id.clone();
+        let machine = Machine::default();
+        Node { shared, fixed, boot_id, position, machine, told: None, told_pose: None }
+    }
+
+    /// Everything, for a Hello.
+    pub(crate) fn state(&mut self) -> proto::NodeState {
+        let pose = self.position.as_ref().and_then(|position| position.current());
+        self.told_pose.clone_from(&pose);
+        let mut state = self.without_pose();
+        self.told = Some(state.clone());
+        state.pose = pose.as_ref().map(proto::Pose::from);
+        state
+    }
+
+    fn without_pose(&self) -> proto::NodeState {
+        let runtime = |name: &str, status: crate::runtime::RuntimeStatus| RuntimeStatus {
+            name: name.to_owned(),
+            available: status.available,
+            version: status.version,
+            message: status.message,
+        };
+        let runtimes = vec![
+            runtime("process", self.shared.process.status()),
+            runtime("docker", self.shared.docker.status()),
+        ];
+        let mut state = proto::NodeState::from(&NodeReport { runtimes, ..self.fixed.clone() });
+        state.boot_id.clone_from(&self.boot_id);
+        state
+    }
+
+    /// The state, when something about it has changed since it was last told.
+    pub(crate) fn changed(&mut self) -> Option<proto::NodeState> {
+        if self.told.as_ref() == Some(&self.without_pose()) { None } else { Some(self.state()) }
+    }
+
+    /// The pose, when it has changed since it was last told.
+    pub(crate) fn moved(&mut self) -> Option<proto::Pose> {
+        let pose = self.position.as_ref()?.current();
+        if pose == self.told_pose {
+            return None;
+        }
+        self.told_pose.clone_from(&pose);
+        pose.as_ref().map(proto::Pose::from)
+    }
+
+    /// The machine's usage since the last look.
+    pub(crate) fn usage(&mut self) -> Option<proto::Usage> {
+        let (cpu_millis, memory_bytes) = self.machine.sample()?;
+        Some(proto::Usage { cpu_millis, memory_bytes, cpu_total_usec: 0 })
+    }
+}
+
+fn labels(config: &Config) -> BTreeMap<String, String> {
+    let mut labels = BTreeMap::from([
+        ("muster.dev/arch".to_owned(), std::env::consts::ARCH.to_owned()),
+        ("muster.dev/os".to_owned(), std::env::consts::OS.to_owned()),
+    ]);
+    labels.extend(config.labels.clone());
+    labels
+}
+
+fn conditions(config: &Config, enforced: Result<Enforced, String>) -> Vec<Condition> {
+    let condition = |r#type: &str, status: bool, reason: &str, message: String| Condition {
+        r#type: r#type.to_owned(),
+        status: ConditionStatus::from(status),
+        reason: reason.to_owned(),
+        message,
+        last_transition_time: None,
+    };
+    let mut conditions = match enforced {
+        Ok(Enforced { version: 1 }) => vec![
+            condition(QUOTAS_ENFORCED, true, "CgroupV1", String::new()),
+            condition(
+                "BufferedWritesThrottled",
+                false,
+                "CgroupV1",
+                "cgroup v1 throttles direct and read I/O; buffered writes are not held".to_owned(),
+            ),
+        ],
+        Ok(Enforced { .. }) => {
+            vec![condition(QUOTAS_ENFORCED, true, "CgroupV2", String::new())]
+        }
+        Err(why) => {
+            let then = if config.unenforced_quotas {
+                "tasks with quotas run unlimited (--unenforced-quotas)"
+            } else {
+                "tasks with quotas are refused"
+            };
+            vec![condition(QUOTAS_ENFORCED, false, "NoCgroups", format!("{why}; {then}"))]
+        }
+    };
+    if !config.actuators.is_empty() {
+        conditions.push(condition(
+            "ActuatorsFenced",
+            false,
+            "NoGate",
+            "no gate stands before this robot's drivers: leases are kept, commands are not checked"
+                .to_owned(),
+        ));
+    }
+    conditions
+}

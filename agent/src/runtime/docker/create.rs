@@ -1,0 +1,160 @@
+//! A launch as the engine wants it.
+
+use std::collections::HashMap;
+
+use bollard::models::{
+    ContainerCreateBody, HostConfig, HostConfigLogConfig, Mount, MountType, ThrottleDevice,
+};
+use muster_agent_core::workload::Failure;
+
+use super::DockerConfig;
+use crate::runtime::cgroup::device;
+use crate::runtime::launch::{Container, Launch, Network, Program};
+
+/// Whose container it is.
+pub(super) const LABEL_AGENT: &str = "muster.dev/agent";
+/// Which task it is.
+pub(super) const LABEL_UID: &str = "muster.dev/task-uid";
+/// Which attempt of the task it is.
+pub(super) const LABEL_ATTEMPT: &str = "muster.dev/attempt";
+
+/// Where a container sees its task's run directory.
+const RUN_DIR: &str = "/run/muster";
+
+/// The least cpu weight that the engine gives: that of a task which reserved none.
+const MIN_SHARES: i64 = 2;
+
+/// The least memory limit that the engine takes.
+const MIN_MEMORY: u64 = 6 << 20;
+
+pub(super) fn body(launch: &Launch, config: &DockerConfig) -> Result<ContainerCreateBody, Failure> {
+    let Program::Container(container) = &launch.program else {
+        let message = "the launch is no container's".to_owned();
+        return Err(Failure { reason: "NodeError".to_owned(), message, retry: false });
+    };
+    let run_dir = config.tasks.join(launch.id.uid.as_str()).join("run");
+    std::fs::create_dir_all(&run_dir).map_err(|error| Failure {
+        reason: "NodeError".to_owned(),
+        message: format!("failed to make {}: {error}", run_dir.display()),
+        retry: true,
+    })?;
+    let mut env = launch.env.clone();
+    env.insert("MUSTER_RUN_DIR".to_owned(), RUN_DIR.to_owned());
+    let list = |words: &[String]| if words.is_empty() { None } else { Some(words.to_vec()) };
+    Ok(ContainerCreateBody {
+        image: Some(container.image.clone()),
+        entrypoint: list(&container.command),
+        cmd: list(&container.args),
+        working_dir: container.working_dir.clone(),
+        env: Some(env.iter().map(|(name, value)| format!("{name}={value}")).collect()),
+        labels: Some(labels(launch, config)),
+        host_config: Some(host(launch, container, config, &run_dir.display().to_string())?),
+        ..ContainerCreateBody::default()
+    })
+}
+
+fn labels(launch: &Launch, config: &DockerConfig) -> HashMap<String, String> {
+    HashMap::from([
+        (LABEL_AGENT.to_owned(), config.identity.clone()),
+        (LABEL_UID.to_owned(), launch.id.uid.to_string()),
+        (LABEL_ATTEMPT.to_owned(), launch.id.attempt.to_string()),
+    ])
+}
+
+fn host(
+    launch: &Launch,
+    container: &Container,
+    config: &DockerConfig,
+    run_dir: &str,
+) -> Result<HostConfig, Failure> {
+    let limits = &launch.limits;
+    let signed = |value: u64| i64::try_from(value).unwrap_or(i64::MAX);
+    let memory = limits.memory_bytes.map(|bytes| signed(bytes.max(MIN_MEMORY)));
+    let mut mounts = vec![mount(run_dir, RUN_DIR, false)];
+    mounts.extend(container.mounts.iter().map(|m| mount(&m.host, &m.container, m.read_only)));
+    let throttle = |bps: Option<u64>| -> Result<Option<Vec<ThrottleDevice>>, Failure> {
+        let Some(bps) = bps else { return Ok(None) };
+        let path = disk(config)?;
+        Ok(Some(vec![ThrottleDevice { path: Some(path), rate: Some(signed(bps)) }]))
+    };
+    Ok(HostConfig {
+        nano_cpus: limits.cpu_millis.map(|millis| signed(millis.saturating_mul(1_000_000))),
+        cpu_shares: Some(limits.cpu_millis.map_or(MIN_SHARES, |millis| {
+            signed(millis.saturating_mul(1_024) / 1_000).max(MIN_SHARES)
+        })),
+        memory,
+        // Memory and swap together: no swap.
+        memory_swap: memory,
+        pids_limit: limits.pids.map(signed),
+        blkio_device_read_bps: throttle(limits.read_bps)?,
+        blkio_device_write_bps: throttle(limits.write_bps)?,
+        network_mode: Some(
+            match container.network {
+                Network::Host => "host",
+                Network::None => "none",
+                Network::Bridge => "bridge",
+            }
+            .to_owned(),
+        ),
+        mounts: Some(mounts),
+        // The engine's own bounds, like those of process tasks.
+        log_config: Some(HostConfigLogConfig {
+            typ: Some("json-file".to_owned()),
+            config: Some(HashMap::from([
+                ("max-size".to_owned(), "10m".to_owned()),
+                ("max-file".to_owned(), "5".to_owned()),
+            ])),
+        }),
+        auto_remove: Some(false),
+        ..HostConfig::default()
+    })
+}
+
+fn mount(source: &str, target: &str, read_only: bool) -> Mount {
+    Mount {
+        source: Some(source.to_owned()),
+        target: Some(target.to_owned()),
+        typ: Some(MountType::BIND),
+        read_only: Some(read_only),
+        ..Mount::default()
+    }
+}
+
+fn disk(config: &DockerConfig) -> Result<String, Failure> {
+    let refused = |message: String| Failure {
+        reason: "QuotaNotEnforced".to_owned(),
+        message: format!("an I/O rate cannot be enforced here: {message}"),
+        retry: false,
+    };
+    match device::disk_of(&config.tasks) {
+        Ok(Some(disk)) => device::path_of(disk).map_err(|error| refused(error.to_string())),
+        Ok(None) => Err(refused(format!("{} is on no block device", config.tasks.display()))),
+        Err(error) => Err(refused(error.to_string())),
+    }
+}
+
+/// `name`, `tag` of an image; a digest goes where the tag does, and no tag is `latest`, not all.
+pub(super) fn image_and_tag(image: &str) -> (&str, &str) {
+    if let Some((name, digest)) = image.split_once('@') {
+        return (name, digest);
+    }
+    match image.rsplit_once(':') {
+        // A colon before a slash is a registry's port.
+        Some((name, tag)) if !tag.contains('/') => (name, tag),
+        _ => (image, "latest"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn images_and_tags() {
+        assert_eq!(image_and_tag("a"), ("a", "latest"));
+        assert_eq!(image_and_tag("a:1"), ("a", "1"));
+        assert_eq!(image_and_tag("host:5000/a"), ("host:5000/a", "latest"));
+        assert_eq!(image_and_tag("host:5000/a:2"), ("host:5000/a", "2"));
+        assert_eq!(image_and_tag("a@sha256:0"), ("a", "sha256:0"));
+    }
+}

@@ -1,0 +1,458 @@
+//! Containers of a Docker Engine. The engine outlives the agent, so a container needs no shim: its
+//! name is the attempt, which makes a second launch of it impossible.
+//!
+//! | module | holds |
+//! |---|---|
+//! | [`engine`] | the connection, the stream of events, whether the engine is there |
+//! | [`create`] | a launch as the engine wants it |
+//! | [`inspect`] | what the engine says of a container, as the core wants it |
+//! | [`guard`] | the process that ends a container when the agent cannot |
+//!
+//! Level-triggered: an event only says which container to look at; after every reconnection each is
+//! looked at. An end is told when the engine says so *and* the kernel shows the group empty.
+
+mod create;
+mod engine;
+mod guard;
+mod inspect;
+
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+use std::process::Child;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+
+use bollard::Docker;
+use bollard::query_parameters::{
+    CreateContainerOptionsBuilder, CreateImageOptionsBuilder, KillContainerOptionsBuilder,
+    LogsOptionsBuilder, RemoveContainerOptionsBuilder, StopContainerOptionsBuilder,
+};
+use bytes::Bytes;
+use futures::future::{BoxFuture, FutureExt};
+use futures::stream::{BoxStream, StreamExt, TryStreamExt};
+use muster_agent_core::observed::{End, Exit, Loss, Observed, Started};
+use muster_agent_core::workload::Failure;
+use muster_api::id::TaskUid;
+use tokio::sync::Notify;
+
+use super::cgroup::group::Group;
+use super::process::{KEPT_ATTEMPTS, Reexec};
+use super::{AttemptId, Launch, Launched, LogQuery, Runtime, RuntimeError, RuntimeStatus, Used};
+use crate::clock;
+use crate::driver::chain;
+use crate::runtime::launch::{Container, Program, Pull};
+use engine::Engine;
+use inspect::Seen;
+
+/// What the runtime is made of.
+#[derive(Debug)]
+pub(crate) struct DockerConfig {
+    /// Absent: no Docker.
+    pub(crate) socket: Option<PathBuf>,
+    /// The agent's: names its containers.
+    pub(crate) identity: String,
+    /// Holds `<uid>/run`, which containers see.
+    pub(crate) tasks: PathBuf,
+    pub(crate) reexec: Reexec,
+    pub(crate) contact: PathBuf,
+}
+
+/// The runtime. Cheap to clone; all clones are one.
+#[derive(Debug, Clone)]
+pub(crate) struct DockerRuntime(Arc<Inner>);
+
+#[derive(Debug)]
+struct Inner {
+    config: DockerConfig,
+    engine: Engine,
+    live: Mutex<BTreeMap<AttemptId, Live>>,
+    boot_id: String,
+    /// Guards of this life of the agent, to be taken out of the process table.
+    guards: Mutex<Vec<Child>>,
+}
+
+/// A container that somebody waits for.
+#[derive(Debug, Clone, Default)]
+struct Live {
+    group: Option<Group>,
+    changed: Arc<Notify>,
+}
+
+impl DockerRuntime {
+    pub(crate) fn new(config: DockerConfig) -> DockerRuntime {
+        let engine = Engine::new(config.socket.clone());
+        let boot_id = clock::boot_id();
+        DockerRuntime(Arc::new(Inner {
+            config,
+            engine,
+            live: Mutex::default(),
+            boot_id,
+            guards: Mutex::default(),
+        }))
+    }
+
+    fn live(&self) -> MutexGuard<'_, BTreeMap<AttemptId, Live>> {
+        self.0.live.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn watched(&self, id: &AttemptId) -> Live {
+        self.live().entry(id.clone()).or_default().clone()
+    }
+
+    fn name(&self, id: &AttemptId) -> String {
+        format!("muster-{}-{id}", self.0.config.identity)
+    }
+
+    fn client(&self) -> Result<Docker, RuntimeError> {
+        let error = |source| RuntimeError::new("reach the Docker Engine", source);
+        self.0.engine.client().map_err(error)
+    }
+
+    async fn prepare(&self, container: &Container) -> Result<(), Failure> {
+        let failed = |message: String| Failure {
+            reason: "ImagePullFailed".to_owned(),
+            message: format!("image {:?}: {message}", container.image),
+            retry: true,
+        };
+        let docker = self.client().map_err(|error| self.unavailable(&error))?;
+        let present = match docker.inspect_image(&container.image).await {
+            Ok(_) => true,
+            Err(error) if inspect::is_missing(&error) => false,
+            Err(error) => return Err(self.unavailable(&error)),
+        };
+        match (container.pull, present) {
+            (Pull::Never, false) => {
+                return Err(failed("it is not on this node, and pullPolicy is Never".to_owned()));
+            }
+            (Pull::Never | Pull::IfNotPresent, true) => return Ok(()),
+            (Pull::IfNotPresent, false) | (Pull::Always, _) => {}
+        }
+        let (image, tag) = create::image_and_tag(&container.image);
+        let options = CreateImageOptionsBuilder::new().from_image(image).tag(tag).build();
+        let mut progress = docker.create_image(Some(options), None, None).boxed();
+        while let Some(step) = progress.next().await {
+            step.map_err(|error| failed(chain(&error)))?;
+        }
+        Ok(())
+    }
+
+    fn unavailable(&self, error: &dyn std::error::Error) -> Failure {
+        Failure {
+            reason: "RuntimeUnavailable".to_owned(),
+            message: chain(error),
+            // Without a socket there will be none later either.
+            retry: self.0.config.socket.is_some(),
+        }
+    }
+
+    async fn launch(&self, launch: &Launch) -> Launched {
+        let docker = match self.client() {
+            Ok(docker) => docker,
+            Err(error) => return Launched::Refused(self.unavailable(&error)),
+        };
+        let name = self.name(&launch.id);
+        let body = match create::body(launch, &self.0.config) {
+            Ok(body) => body,
+            Err(failure) => return Launched::Refused(failure),
+        };
+        if let Some(old) = launch.id.attempt.checked_sub(KEPT_ATTEMPTS).filter(|old| *old > 0) {
+            let old = AttemptId { uid: launch.id.uid.clone(), attempt: old };
+            // Older logs go; a failure only keeps them longer.
+            let _ = self.remove_container(&docker, &self.name(&old)).await;
+        }
+        let options = CreateContainerOptionsBuilder::new().name(&name).build();
+        if let Err(error) = docker.create_container(Some(options), body).await {
+            return match inspect::refusal(&error) {
+                Some((409, _)) => Launched::Unclear(RuntimeError::new("create a container", error)),
+                Some((404, message)) => refused("ImageMissing", message, true),
+                Some((_, message)) => refused("CreateContainerError", message, false),
+                None => Launched::Unclear(RuntimeError::new("create a container", error)),
+            };
+        }
+        self.start(&docker, &name, launch).await
+    }
+
+    async fn start(&self, docker: &Docker, name: &str, launch: &Launch) -> Launched {
+        if let Err(error) = docker.start_container(name, None).await {
+            return match inspect::refusal(&error) {
+                // The engine's words: a program that is not there, a mount that is not, …
+                Some((_, message)) => Launched::Ended(not_started(message)),
+                None => Launched::Unclear(RuntimeError::new("start a container", error)),
+            };
+        }
+        if launch.stop_after_ms.is_some() {
+            // Before the task is said to run: it must not run a moment that nobody would end.
+            if let Err(error) = self.guard(docker, launch).await {
+                tracing::error!(id = %launch.id, error = chain(&error), "no guard; it is ended");
+                if let Err(error) = self.kill(docker, &launch.id).await {
+                    return Launched::Unclear(error);
+                }
+            }
+        }
+        Launched::Running(Started { at: clock::wall() })
+    }
+
+    /// Starts the process that ends the container when contact is lost and the agent cannot.
+    async fn guard(&self, docker: &Docker, launch: &Launch) -> Result<(), RuntimeError> {
+        let what = "guard a container";
+        let name = self.name(&launch.id);
+        let seen = inspect::inspect(docker, &name).await.map_err(|e| RuntimeError::new(what, e))?;
+        let Some(Seen::Running { pid, .. }) = seen else { return Ok(()) };
+        let Some(group) = self.group_of(&launch.id, pid) else { return Ok(()) };
+        let started = guard::start(&self.0.config, &self.0.boot_id, launch, pid, group).await;
+        let started = started.map_err(|error| RuntimeError::new(what, error))?;
+        let mut guards = self.0.guards.lock().unwrap_or_else(PoisonError::into_inner);
+        guards.retain_mut(|guard| matches!(guard.try_wait(), Ok(None)));
+        guards.extend(started);
+        Ok(())
+    }
+
+    fn group_of(&self, id: &AttemptId, pid: i32) -> Option<Group> {
+        let group = super::cgroup::hierarchy::group_of(pid);
+        self.live().entry(id.clone()).or_default().group.clone_from(&group);
+        group
+    }
+
+    async fn find(&self, launch: &Launch) -> Result<Observed, RuntimeError> {
+        let what = "find a container";
+        let docker = self.client()?;
+        let name = self.name(&launch.id);
+        match inspect::inspect(&docker, &name).await.map_err(|e| RuntimeError::new(what, e))? {
+            None => Ok(Observed::NeverStarted),
+            Some(Seen::Created) => {
+                self.remove_container(&docker, &name).await?;
+                Ok(Observed::NeverStarted)
+            }
+            Some(Seen::Running { pid, at }) => {
+                self.group_of(&launch.id, pid);
+                if launch.stop_after_ms.is_some() {
+                    self.guard(&docker, launch).await?;
+                }
+                Ok(Observed::Running(Started { at }))
+            }
+            Some(Seen::Ended(exit)) => Ok(Observed::Ended(self.ended(&launch.id, exit))),
+        }
+    }
+
+    /// An exit as the engine tells it, with what only this node knows.
+    fn ended(&self, id: &AttemptId, exit: Exit) -> Exit {
+        let disconnected = guard::ended_it(&self.0.config, id);
+        Exit { disconnected, ..exit }
+    }
+
+    async fn wait(&self, launch: &Launch) -> Exit {
+        let id = &launch.id;
+        let name = self.name(id);
+        let changed = self.watched(id).changed;
+        loop {
+            // Asked for before the look, so that a change after the look is not missed.
+            let next = changed.notified();
+            let looked = match self.client() {
+                Ok(docker) => inspect::inspect(&docker, &name).await.map_err(|e| chain(&e)),
+                Err(error) => Err(chain(&error)),
+            };
+            match looked {
+                Ok(Some(Seen::Ended(exit))) => {
+                    self.wait_empty(id).await;
+                    self.live().remove(id);
+                    return self.ended(id, exit);
+                }
+                Ok(Some(Seen::Running { pid, .. })) => {
+                    if self.watched(id).group.is_none() {
+                        self.group_of(id, pid);
+                    }
+                    next.await;
+                }
+                // Created: its start is under way, and an event follows.
+                Ok(Some(Seen::Created)) => next.await,
+                Ok(None) => {
+                    self.wait_empty(id).await;
+                    self.live().remove(id);
+                    return self.ended(id, lost());
+                }
+                Err(error) => {
+                    // The engine is away; the reconnection wakes everybody.
+                    tracing::debug!(%id, error, "a container cannot be seen");
+                    next.await;
+                }
+            }
+        }
+    }
+
+    /// The engine tells an end when the first process is gone; the kernel has the last word.
+    async fn wait_empty(&self, id: &AttemptId) {
+        let Some(group) = self.watched(id).group else { return };
+        let mut pause = Duration::from_millis(1);
+        while !group.is_empty() {
+            group.kill();
+            tokio::time::sleep(pause).await;
+            pause = (pause * 2).min(Duration::from_millis(200));
+        }
+    }
+
+    async fn kill(&self, docker: &Docker, id: &AttemptId) -> Result<(), RuntimeError> {
+        let options = KillContainerOptionsBuilder::new().signal("SIGKILL").build();
+        match docker.kill_container(&self.name(id), Some(options)).await {
+            Err(error) if !inspect::is_over(&error) => {
+                Err(RuntimeError::new("kill a container", error))
+            }
+            _ => Ok(()),
+        }
+    }
+
+    async fn stop(&self, id: &AttemptId, grace: Duration) -> Result<(), RuntimeError> {
+        let docker = self.client()?;
+        if grace < Duration::from_secs(1) {
+            // The engine knows whole seconds only: a fraction of one is none.
+            return self.kill(&docker, id).await;
+        }
+        let seconds = i32::try_from(grace.as_secs()).unwrap_or(i32::MAX);
+        let options = StopContainerOptionsBuilder::new().t(seconds).build();
+        let name = self.name(id);
+        // The engine carries its own ladder on when the caller goes away. It answers at the end of
+        // it, or at once with an error: nobody has to wait for the end here.
+        let stop = docker.stop_container(&name, Some(options));
+        match tokio::time::timeout(Duration::from_millis(500), stop).await {
+            Ok(Err(error)) if !inspect::is_over(&error) => {
+                Err(RuntimeError::new("stop a container", error))
+            }
+            _ => Ok(()),
+        }
+    }
+
+    async fn remove_container(&self, docker: &Docker, name: &str) -> Result<(), RuntimeError> {
+        let options = RemoveContainerOptionsBuilder::new().force(true).v(true).build();
+        match docker.remove_container(name, Some(options)).await {
+            Err(error) if !inspect::is_missing(&error) => {
+                Err(RuntimeError::new("remove a container", error))
+            }
+            _ => Ok(()),
+        }
+    }
+
+    async fn remove(&self, uid: &TaskUid) -> Result<(), RuntimeError> {
+        if self.0.config.socket.is_none() {
+            return Ok(());
+        }
+        let docker = self.client()?;
+        let filter = format!("{}={uid}", create::LABEL_UID);
+        let names = engine::names(&docker, &self.0.config.identity, Some(&filter));
+        for (name, _) in names.await.map_err(|e| RuntimeError::new("list containers", e))? {
+            self.remove_container(&docker, &name).await?;
+        }
+        Ok(())
+    }
+
+    /// Follows the engine until it is dropped: keeps its status, wakes who waits for a container,
+    /// and at the first contact removes containers of tasks that this agent does not know.
+    pub(crate) async fn run(&self) {
+        let wake = |id: Option<&AttemptId>| {
+            for (known, live) in self.live().iter() {
+                if id.is_none_or(|id| id == known) {
+                    live.changed.notify_one();
+                }
+            }
+        };
+        let sweep = || self.sweep();
+        self.0.engine.run(&self.0.config.identity, wake, sweep).await;
+    }
+
+    async fn sweep(&self) {
+        let Ok(docker) = self.client() else { return };
+        let Ok(found) = engine::names(&docker, &self.0.config.identity, None).await else { return };
+        for (name, uid) in found {
+            if !self.0.config.tasks.join(&uid).join("task.json").exists() {
+                tracing::info!(%name, "a container of no task is removed");
+                if let Err(error) = self.remove_container(&docker, &name).await {
+                    tracing::warn!(%name, error = chain(&error), "it stays behind");
+                }
+            }
+        }
+    }
+}
+
+fn refused(reason: &str, message: String, retry: bool) -> Launched {
+    Launched::Refused(Failure { reason: reason.to_owned(), message, retry })
+}
+
+fn not_started(message: String) -> Exit {
+    Exit {
+        end: End::NotStarted { message },
+        oom_killed: false,
+        disconnected: false,
+        started_at: None,
+        finished_at: clock::wall(),
+    }
+}
+
+fn lost() -> Exit {
+    Exit { end: End::Lost(Loss::Container), ..not_started(String::new()) }
+}
+
+impl Runtime for DockerRuntime {
+    fn status(&self) -> RuntimeStatus {
+        self.0.engine.status()
+    }
+
+    fn prepare<'a>(&'a self, launch: &'a Launch) -> BoxFuture<'a, Result<(), Failure>> {
+        match &launch.program {
+            Program::Container(container) => self.prepare(container).boxed(),
+            Program::Process { .. } => futures::future::ready(Ok(())).boxed(),
+        }
+    }
+
+    fn launch<'a>(&'a self, launch: &'a Launch) -> BoxFuture<'a, Launched> {
+        self.launch(launch).boxed()
+    }
+
+    fn find<'a>(&'a self, launch: &'a Launch) -> BoxFuture<'a, Result<Observed, RuntimeError>> {
+        self.find(launch).boxed()
+    }
+
+    fn wait<'a>(&'a self, launch: &'a Launch) -> BoxFuture<'a, Exit> {
+        self.wait(launch).boxed()
+    }
+
+    fn stop<'a>(
+        &'a self,
+        id: &'a AttemptId,
+        grace: Duration,
+    ) -> BoxFuture<'a, Result<(), RuntimeError>> {
+        self.stop(id, grace).boxed()
+    }
+
+    fn remove<'a>(&'a self, uid: &'a TaskUid) -> BoxFuture<'a, Result<(), RuntimeError>> {
+        self.remove(uid).boxed()
+    }
+
+    fn used(&self, id: &AttemptId) -> Option<Used> {
+        let group = self.live().get(id)?.group.clone()?;
+        group.used()
+    }
+
+    fn logs(&self, id: &AttemptId, query: LogQuery) -> BoxStream<'static, std::io::Result<Bytes>> {
+        let docker = match self.client() {
+            Ok(docker) => docker,
+            Err(error) => {
+                let error = Err(std::io::Error::other(chain(&error)));
+                return futures::stream::once(futures::future::ready(error)).boxed();
+            }
+        };
+        let tail = query.tail.map_or_else(|| "all".to_owned(), |tail| tail.to_string());
+        let since = query.since.map_or(0, |since| i32::try_from(since.as_second()).unwrap_or(0));
+        let options = LogsOptionsBuilder::new()
+            .stdout(true)
+            .stderr(true)
+            .follow(query.follow)
+            .timestamps(query.timestamps)
+            .tail(&tail)
+            .since(since)
+            .build();
+        let name = self.name(id);
+        docker
+            .logs(&name, Some(options))
+            .map_ok(bollard::container::LogOutput::into_bytes)
+            .map_err(std::io::Error::other)
+            .boxed()
+    }
+}

@@ -1,0 +1,105 @@
+//! What runs tasks. A [`Runtime`] starts, watches, ends and removes attempts; which one a task gets
+//! follows from its spec.
+//!
+//! | module | holds |
+//! |---|---|
+//! | [`process`] | programs of the host, each under a [`shim`](crate::shim) that outlives the agent |
+//! | [`docker`] | containers of a Docker Engine |
+//! | [`cgroup`] | the kernel's groups and limits |
+//! | [`logs`] | task output on disk: written by shims, read here |
+//! | [`fake`] | a runtime with answers given beforehand, for tests |
+
+pub(crate) mod cgroup;
+pub(crate) mod contact;
+pub(crate) mod docker;
+#[cfg(test)]
+pub(crate) mod fake;
+pub(crate) mod launch;
+pub(crate) mod logs;
+pub(crate) mod process;
+
+use std::time::Duration;
+
+use bytes::Bytes;
+use futures::future::BoxFuture;
+use futures::stream::BoxStream;
+use muster_agent_core::observed::{Exit, Observed, Started};
+use muster_agent_core::workload::Failure;
+use muster_api::id::TaskUid;
+
+pub(crate) use launch::{AttemptId, Launch, Limits, Used};
+
+/// What came of a launch.
+#[derive(Debug)]
+pub(crate) enum Launched {
+    /// The program runs.
+    Running(Started),
+    /// It was over, or could not begin, before anybody could say that it ran.
+    Ended(Exit),
+    /// Nothing was started, and nothing will be.
+    Refused(Failure),
+    /// It may or may not have been started: ask with [`Runtime::find`].
+    Unclear(RuntimeError),
+}
+
+/// Why a runtime could not do what it was asked; asking again may help.
+#[derive(Debug, thiserror::Error)]
+#[error("failed to {what}")]
+pub(crate) struct RuntimeError {
+    pub(crate) what: &'static str,
+    #[source]
+    pub(crate) source: Box<dyn std::error::Error + Send + Sync>,
+}
+
+impl RuntimeError {
+    pub(crate) fn new(
+        what: &'static str,
+        source: impl Into<Box<dyn std::error::Error + Send + Sync>>,
+    ) -> Self {
+        RuntimeError { what, source: source.into() }
+    }
+}
+
+/// Which part of a task's output is wanted.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct LogQuery {
+    pub(crate) follow: bool,
+    pub(crate) tail: Option<u64>,
+    pub(crate) timestamps: bool,
+    pub(crate) since: Option<jiff::Timestamp>,
+}
+
+/// Starts, watches, ends and removes attempts. Every answer of [`Runtime::wait`] and of
+/// `Ended` means that the kernel shows no process of the attempt any more.
+pub(crate) trait Runtime: Send + Sync + std::fmt::Debug {
+    /// Whether tasks can be run now; else why not.
+    fn status(&self) -> RuntimeStatus;
+    /// Fetches what the launch needs. May be dropped at any await: what was fetched stays.
+    fn prepare<'a>(&'a self, launch: &'a Launch) -> BoxFuture<'a, Result<(), Failure>>;
+    /// Starts the attempt.
+    fn launch<'a>(&'a self, launch: &'a Launch) -> BoxFuture<'a, Launched>;
+    /// What became of an attempt of an earlier life of the agent.
+    fn find<'a>(&'a self, launch: &'a Launch) -> BoxFuture<'a, Result<Observed, RuntimeError>>;
+    /// Resolves when no process of the attempt is left.
+    fn wait<'a>(&'a self, launch: &'a Launch) -> BoxFuture<'a, Exit>;
+    /// Orders the kill ladder; does not wait for its end. A second order with less grace hastens it.
+    fn stop<'a>(
+        &'a self,
+        id: &'a AttemptId,
+        grace: Duration,
+    ) -> BoxFuture<'a, Result<(), RuntimeError>>;
+    /// Removes every trace of a task of which nothing runs.
+    fn remove<'a>(&'a self, uid: &'a TaskUid) -> BoxFuture<'a, Result<(), RuntimeError>>;
+    /// What the kernel counted for a running attempt.
+    fn used(&self, id: &AttemptId) -> Option<Used>;
+    /// The attempt's output. Ends at the end of what there is, or with `follow` when the attempt ends.
+    fn logs(&self, id: &AttemptId, query: LogQuery) -> BoxStream<'static, std::io::Result<Bytes>>;
+}
+
+/// What the node says about a runtime.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct RuntimeStatus {
+    pub(crate) available: bool,
+    pub(crate) version: String,
+    pub(crate) message: String,
+}

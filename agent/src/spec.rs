@@ -1,0 +1,150 @@
+//! A task's spec, as the parts that decisions and runtimes need.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+use muster_agent_core::desired::{Desired, RestartPolicy, StopOrder};
+use muster_api::kind::task::{self, TaskSpec};
+
+use crate::checkpoint::Assignment;
+use crate::runtime::launch::{AttemptId, Container, Launch, Limits, Mount, Network, Program, Pull};
+
+/// Processes and threads of a task that names no limit: enough for a large ROS graph, and far from
+/// what a fork bomb needs to take a robot down.
+const DEFAULT_PIDS: u64 = 4_096;
+
+/// The least memory cap that the agent puts on a task which reserved none: below it nothing starts.
+const MIN_MEMORY_CAP: u64 = 16 << 20;
+
+/// Which runtime runs a task.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Kind {
+    Process,
+    Docker,
+}
+
+impl Kind {
+    pub(crate) fn of(spec: &TaskSpec) -> Kind {
+        if spec.run.container.is_some() { Kind::Docker } else { Kind::Process }
+    }
+}
+
+/// What the core needs to know.
+pub(crate) fn desired(spec: &TaskSpec, stop: Option<StopOrder>) -> Desired {
+    Desired {
+        restart: match spec.restart_policy {
+            task::RestartPolicy::Never => RestartPolicy::Never,
+            task::RestartPolicy::OnFailure => RestartPolicy::OnFailure,
+            task::RestartPolicy::Always => RestartPolicy::Always,
+        },
+        grace_ms: u64::from(spec.grace_period_seconds) * 1_000,
+        stop_after_ms: spec
+            .stop_after_disconnect()
+            .map(|span| u64::try_from(span.as_duration().as_millis()).unwrap_or(u64::MAX)),
+        stop,
+    }
+}
+
+/// What the node adds to a launch.
+#[derive(Debug, Clone)]
+pub(crate) struct Surroundings<'a> {
+    pub(crate) node: &'a str,
+    /// The task's own directory.
+    pub(crate) task_dir: &'a Path,
+    /// Memory that nobody reserved, bytes.
+    pub(crate) unreserved: u64,
+}
+
+/// What a runtime needs to know.
+pub(crate) fn launch(id: AttemptId, assignment: &Assignment, around: &Surroundings<'_>) -> Launch {
+    let spec = &assignment.spec;
+    let resources = &spec.resources;
+    let io = resources.io.clone().unwrap_or_default();
+    let (program, variables) = program(spec);
+    let mut env = environment(&id, assignment, around);
+    env.extend(variables);
+    Launch {
+        program,
+        env,
+        limits: Limits {
+            cpu_millis: resources.cpu.map(|cpu| cpu.0),
+            memory_bytes: Some(
+                resources
+                    .memory
+                    .map_or_else(|| around.unreserved.max(MIN_MEMORY_CAP), |memory| memory.0),
+            ),
+            pids: Some(resources.pids.unwrap_or(DEFAULT_PIDS)),
+            read_bps: io.read_bps.map(|bps| bps.0),
+            write_bps: io.write_bps.map(|bps| bps.0),
+        },
+        promised: resources.cpu.is_some()
+            || resources.memory.is_some()
+            || resources.pids.is_some()
+            || resources.io.is_some(),
+        grace_ms: u64::from(spec.grace_period_seconds) * 1_000,
+        stop_after_ms: desired(spec, None).stop_after_ms,
+        id,
+    }
+}
+
+fn environment(
+    id: &AttemptId,
+    assignment: &Assignment,
+    around: &Surroundings<'_>,
+) -> BTreeMap<String, String> {
+    let mut env = BTreeMap::from([
+        ("MUSTER_TASK".to_owned(), assignment.name.clone()),
+        ("MUSTER_NAMESPACE".to_owned(), assignment.namespace.clone()),
+        ("MUSTER_UID".to_owned(), id.uid.to_string()),
+        ("MUSTER_NODE".to_owned(), around.node.to_owned()),
+        ("MUSTER_ATTEMPT".to_owned(), id.attempt.to_string()),
+        ("MUSTER_RUN_DIR".to_owned(), around.task_dir.join("run").display().to_string()),
+    ]);
+    if let Some(lease) = &assignment.lease {
+        env.insert("MUSTER_LEASE".to_owned(), lease.clone());
+    }
+    env
+}
+
+fn variables(list: &[task::EnvVar]) -> BTreeMap<String, String> {
+    list.iter().map(|variable| (variable.name.clone(), variable.value.clone())).collect()
+}
+
+fn program(spec: &TaskSpec) -> (Program, BTreeMap<String, String>) {
+    if let Some(run) = &spec.run.container {
+        let program = Program::Container(Container {
+            image: run.image.clone(),
+            command: run.command.clone(),
+            args: run.args.clone(),
+            working_dir: run.working_dir.clone(),
+            mounts: run
+                .mounts
+                .iter()
+                .map(|mount| Mount {
+                    host: mount.host_path.clone(),
+                    container: mount.mount_path.clone(),
+                    read_only: mount.read_only,
+                })
+                .collect(),
+            network: match run.network {
+                task::Network::Host => Network::Host,
+                task::Network::None => Network::None,
+                task::Network::Bridge => Network::Bridge,
+            },
+            pull: match run.pull_policy {
+                task::PullPolicy::Always => Pull::Always,
+                task::PullPolicy::IfNotPresent => Pull::IfNotPresent,
+                task::PullPolicy::Never => Pull::Never,
+            },
+        });
+        return (program, variables(&run.env));
+    }
+    // Admission lets neither through; an empty command fails as a start error that says so.
+    let Some(run) = &spec.run.process else {
+        let none = Program::Process { argv: Vec::new(), working_dir: None, user: None };
+        return (none, BTreeMap::new());
+    };
+    let argv = run.command.iter().chain(&run.args).cloned().collect();
+    let working_dir = run.working_dir.as_ref().map(PathBuf::from);
+    (Program::Process { argv, working_dir, user: run.user.clone() }, variables(&run.env))
+}

@@ -1,0 +1,232 @@
+//! Containers under a real agent and a real Docker Engine. Needs a running engine and busybox-static.
+
+#![expect(clippy::unwrap_used, reason = "tests")]
+
+mod common;
+
+use std::process::Command;
+use std::sync::OnceLock;
+use std::time::{Duration, Instant};
+
+use common::agent::Agent;
+use common::controller::Controller;
+use common::until;
+use muster_api::wire::agent::v1 as proto;
+use serde_json::{Value, json};
+
+const IMAGE: &str = "muster-test/busybox:1";
+
+fn docker(args: &[&str]) -> String {
+    let output = Command::new("docker").args(args).output().expect("docker is installed");
+    assert!(
+        output.status.success(),
+        "docker {args:?}: {}",
+        String::from_utf8_lossy(&output.stderr)
+    );
+    String::from_utf8(output.stdout).unwrap().trim().to_owned()
+}
+
+/// An image of one static binary: nothing is fetched.
+fn image() -> &'static str {
+    static MADE: OnceLock<()> = OnceLock::new();
+    MADE.get_or_init(|| {
+        let dir = tempfile::tempdir().unwrap();
+        let bin = dir.path().join("bin");
+        std::fs::create_dir(&bin).unwrap();
+        for name in ["busybox", "sh", "sleep", "echo", "dd", "cat", "id"] {
+            std::fs::copy("/bin/busybox", bin.join(name)).unwrap();
+        }
+        let tar = dir.path().join("root.tar");
+        let packed = Command::new("tar")
+            .args(["-C", dir.path().to_str().unwrap(), "-cf", tar.to_str().unwrap(), "bin"])
+            .status()
+            .unwrap();
+        assert!(packed.success());
+        docker(&["import", tar.to_str().unwrap(), IMAGE]);
+    });
+    IMAGE
+}
+
+/// Removes the containers of a test's tasks.
+struct Cleanup(Vec<&'static str>);
+
+impl Drop for Cleanup {
+    fn drop(&mut self) {
+        for uid in &self.0 {
+            let ids =
+                docker(&["ps", "-aq", "--filter", &format!("label=muster.dev/task-uid={uid}")]);
+            for id in ids.lines() {
+                docker(&["rm", "-f", id]);
+            }
+        }
+    }
+}
+
+fn start(controller: &Controller) -> Agent {
+    let agent = Agent::start_with(controller, &["--docker-socket", "/var/run/docker.sock"]);
+    until("docker", || {
+        let state = controller.state()?;
+        state.runtimes.iter().any(|r| r.name == "docker" && r.available).then_some(())
+    });
+    agent
+}
+
+fn sh(script: &str) -> Value {
+    json!({ "run": { "container": {
+        "image": image(), "command": ["/bin/sh", "-c", script], "network": "None" } } })
+}
+
+fn container(uid: &str) -> String {
+    until("a container", || {
+        let id = docker(&[
+            "ps",
+            "-aq",
+            "--no-trunc",
+            "--filter",
+            &format!("label=muster.dev/task-uid={uid}"),
+        ]);
+        (!id.is_empty()).then_some(id)
+    })
+}
+
+#[test]
+fn a_container_runs_and_its_exit_code_is_reported() {
+    let _cleanup = Cleanup(vec!["d-ok", "d-bad", "d-none"]);
+    let controller = Controller::start();
+    let _agent = start(&controller);
+    let mut spec = sh("echo out $MUSTER_TASK $A; pwd; echo data > /data/file; exit 0");
+    let dir = tempfile::tempdir().unwrap();
+    spec["run"]["container"]["env"] = json!([{ "name": "A", "value": "b" }]);
+    spec["run"]["container"]["workingDir"] = json!("/bin");
+    spec["run"]["container"]["mounts"] = json!([{ "hostPath": dir.path(), "mountPath": "/data" }]);
+    controller.assign("d-ok", spec);
+    let end = controller.wait_end("d-ok");
+    assert_eq!((end.exit_code, end.reason.as_str()), (Some(0), "Completed"), "{end:?}");
+    let ask = proto::LogRequest { id: 1, uid: "d-ok".to_owned(), ..Default::default() };
+    assert_eq!(controller.logs(ask).0, "out task-d-ok b\n/bin\n");
+    assert_eq!(std::fs::read_to_string(dir.path().join("file")).unwrap(), "data\n");
+    controller.assign("d-bad", sh("exit 6"));
+    assert_eq!(controller.wait_end("d-bad").exit_code, Some(6));
+    let mut spec = sh("");
+    spec["run"]["container"]["command"] = json!(["/no/such"]);
+    controller.assign("d-none", spec);
+    let end = controller.wait_end("d-none");
+    assert!(end.reason == "StartError" && end.message.contains("/no/such"), "{end:?}");
+    controller.release("d-ok");
+    until("the container to go", || {
+        docker(&["ps", "-aq", "--filter", "label=muster.dev/task-uid=d-ok"])
+            .is_empty()
+            .then_some(())
+    });
+}
+
+#[test]
+fn limits_are_the_kernels() {
+    let _cleanup = Cleanup(vec!["d-spin", "d-fat"]);
+    let controller = Controller::start();
+    let _agent = start(&controller);
+    let mut spec = sh("while :; do :; done");
+    spec["resources"] =
+        json!({ "cpu": "500m", "memory": "64Mi", "pids": 20, "io": { "writeBps": "1Mi" } });
+    controller.assign("d-spin", spec);
+    controller.wait_running("d-spin");
+    let usage = || controller.usage("d-spin").map(|usage| usage.cpu_total_usec);
+    // The engine's own group weighs like one process of the host: on a busy host a container gets less
+    // than its quota, so only the upper bound can be relied on here.
+    let (before, begun) = (until("usage", usage), Instant::now());
+    std::thread::sleep(Duration::from_secs(3));
+    let used = (usage().unwrap() - before) as f64 / begun.elapsed().as_micros() as f64;
+    // Told ten times a second: a window may be off by one heartbeat.
+    assert!((0.05..=0.55).contains(&used), "{used} cores");
+    let found: Value = serde_json::from_str(&docker(&["inspect", &container("d-spin")])).unwrap();
+    let host = &found[0]["HostConfig"];
+    assert_eq!(
+        (host["Memory"].as_u64(), host["MemorySwap"].as_u64()),
+        (Some(64 << 20), Some(64 << 20))
+    );
+    assert_eq!(
+        (host["PidsLimit"].as_u64(), host["NanoCpus"].as_u64()),
+        (Some(20), Some(500_000_000))
+    );
+    assert_eq!(host["BlkioDeviceWriteBps"][0]["Rate"].as_u64(), Some(1 << 20));
+    controller.stop("d-spin", 0);
+    controller.wait_end("d-spin");
+    let mut spec = sh("exec dd if=/dev/zero of=/dev/null bs=200M count=1");
+    spec["resources"] = json!({ "memory": "64Mi" });
+    controller.assign("d-fat", spec);
+    let end = controller.wait_end("d-fat");
+    assert_eq!((end.reason.as_str(), end.exit_code), ("OOMKilled", Some(137)), "{end:?}");
+}
+
+#[test]
+fn containers_outlive_the_agent() {
+    let _cleanup = Cleanup(vec!["d-keep", "d-end"]);
+    let controller = Controller::start();
+    let mut agent = start(&controller);
+    controller.assign("d-keep", sh("while :; do sleep 1; done"));
+    controller.assign("d-end", sh("while [ ! -e /run/muster/go ]; do sleep 0.05; done; exit 8"));
+    controller.wait_running("d-keep");
+    controller.wait_running("d-end");
+    let pid = |uid: &str| docker(&["inspect", "-f", "{{.State.Pid}}", &container(uid)]);
+    let before = pid("d-keep");
+    agent.kill();
+    std::fs::write(agent.task_dir("d-end").join("run/go"), "").unwrap();
+    until("the end", || (pid("d-end") == "0").then_some(()));
+    agent.spawn();
+    controller.wait_hello(2);
+    let end = controller.wait_end("d-end");
+    assert_eq!((end.exit_code, end.attempt), (Some(8), 1));
+    assert_eq!(pid("d-keep"), before);
+    controller.stop("d-keep", 1_000);
+    let end = controller.wait_end("d-keep");
+    assert_eq!((end.reason.as_str(), end.exit_code), ("Stopped", Some(137)), "{end:?}");
+}
+
+#[test]
+fn an_image_that_cannot_be_had_says_so_and_is_tried_again() {
+    let _cleanup = Cleanup(vec!["d-image"]);
+    let controller = Controller::start();
+    let _agent = start(&controller);
+    let mut spec = sh("exit 0");
+    // A name of this run's own: nobody can have left it behind.
+    let name = format!("muster-test/none-{}:1", std::process::id());
+    spec["run"]["container"]["image"] = json!(name);
+    spec["run"]["container"]["pullPolicy"] = json!("Never");
+    controller.assign("d-image", spec);
+    let waits = controller.wait("d-image", "reason", |report| report.reason == "ImagePullFailed");
+    assert_eq!(waits.phase(), proto::TaskPhase::Starting);
+    assert!(waits.message.contains(&name), "{waits:?}");
+    docker(&["tag", image(), &name]);
+    assert_eq!(controller.wait_end("d-image").exit_code, Some(0));
+    docker(&["rmi", "-f", &name]);
+}
+
+#[test]
+fn a_container_that_may_not_run_alone_ends_alone() {
+    let _cleanup = Cleanup(vec!["d-tied"]);
+    let controller = Controller::start();
+    let mut agent = start(&controller);
+    let mut spec = sh("while :; do sleep 1; done");
+    spec["onDisconnect"] = json!({ "policy": "Stop", "after": "1s" });
+    spec["gracePeriodSeconds"] = json!(0);
+    controller.assign("d-tied", spec);
+    controller.wait_running("d-tied");
+    agent.kill();
+    let running = || docker(&["inspect", "-f", "{{.State.Running}}", &container("d-tied")]);
+    until("the end by the guard", || (running() == "false").then_some(()));
+    agent.spawn();
+    assert_eq!(controller.wait_end("d-tied").reason, "Disconnected");
+}
+
+#[test]
+fn a_container_removed_by_somebody_else_is_lost() {
+    let _cleanup = Cleanup(vec!["d-gone"]);
+    let controller = Controller::start();
+    let _agent = start(&controller);
+    controller.assign("d-gone", sh("while :; do sleep 1; done"));
+    controller.wait_running("d-gone");
+    docker(&["rm", "-f", &container("d-gone")]);
+    let end = controller.wait_end("d-gone");
+    assert_eq!(end.phase(), proto::TaskPhase::Failed);
+    assert!(matches!(end.reason.as_str(), "ContainerLost" | "Error"), "{end:?}");
+}

@@ -1,0 +1,180 @@
+//! Joining, losing and finding the controller.
+
+#![expect(clippy::unwrap_used, reason = "tests")]
+
+mod common;
+
+use common::agent::{Agent, command};
+use common::controller::Controller;
+use common::{lives, until};
+use muster_api::wire::agent::v1 as proto;
+use serde_json::json;
+
+fn sh(script: &str) -> serde_json::Value {
+    json!({ "run": { "process": { "command": ["sh", "-c", script] } } })
+}
+
+fn refused(args: &[&str], dir: &std::path::Path) -> (Option<i32>, String) {
+    let args: Vec<String> = args.iter().map(|arg| (*arg).to_owned()).collect();
+    let output = command(dir, &args).env_remove("RUST_LOG").output().unwrap();
+    (output.status.code(), String::from_utf8(output.stderr).unwrap())
+}
+
+#[test]
+fn joins_are_refused_with_reasons() {
+    let controller = Controller::start();
+    let dir = tempfile::tempdir().unwrap();
+    let url = controller.url();
+    let base = ["--name", "r", "--kind", "robot", "--docker-socket", "none", "--join", &url];
+    let with = |token: &str| {
+        let mut args = base.to_vec();
+        args.extend(["--token", token]);
+        refused(&args, dir.path())
+    };
+    let (code, text) = refused(&base, dir.path());
+    assert!(code == Some(2) && text.contains("--token is missing"), "{text}");
+    let (code, text) = with("nonsense");
+    assert!(code == Some(2) && text.contains("not a join token"), "{text}");
+    let wrong_ca = format!("muster1.id.secret.{}", "00".repeat(32));
+    let (code, text) = with(&wrong_ca);
+    assert!(code == Some(3) && text.contains("another hash"), "{text}");
+    let expired = controller.token().replace("secret", "old");
+    let (code, text) = with(&expired);
+    assert!(code == Some(3) && text.contains("the token has expired"), "{text}");
+    assert_eq!(controller.joins(), 0);
+}
+
+#[test]
+fn a_directory_is_of_one_node() {
+    let controller = Controller::start();
+    let mut agent = Agent::start(&controller);
+    assert_eq!(agent.terminate(), Some(0));
+    let url = controller.url();
+    let (code, text) = refused(&["--name", "other", "--join", &url], agent.dir.path());
+    assert!(code == Some(2) && text.contains("robot-1"), "{text}");
+    // It needs neither token nor name nor address again.
+    agent.args = vec!["--docker-socket".to_owned(), "none".to_owned()];
+    agent.spawn();
+    assert_eq!(controller.wait_hello(2).node, "robot-1");
+    assert_eq!(controller.joins(), 1);
+}
+
+#[test]
+fn the_node_says_what_it_is() {
+    let controller = Controller::start();
+    let args = [
+        "--sr-res",
+        "kinect:ImageGen",
+        "--ar-res",
+        "base:Drive",
+        "--label",
+        "a=b",
+        "--speed",
+        "0.5",
+    ];
+    let _agent = Agent::start_with(&controller, &args);
+    let state = controller.state().unwrap();
+    assert_eq!(state.sensors, ["kinect:ImageGen"]);
+    assert_eq!(state.actuators, ["base:Drive"]);
+    assert_eq!(state.labels["a"], "b");
+    let pose = state.pose.unwrap();
+    assert_eq!((pose.x, pose.y, pose.map.as_str()), (1.0, 2.0, "map"));
+    let enforced = state.conditions.iter().find(|c| c.r#type == "QuotasEnforced").unwrap();
+    assert!(enforced.status, "{enforced:?}");
+    assert!(state.runtimes.iter().any(|r| r.name == "process" && r.available));
+    assert!(state.runtimes.iter().any(|r| r.name == "docker" && !r.available));
+}
+
+#[test]
+fn everything_goes_on_without_a_controller() {
+    let controller = Controller::start();
+    let mut agent = Agent::start(&controller);
+    let go = agent.dir.path().join("go");
+    controller.assign("keep", sh("sleep 1000"));
+    controller.assign(
+        "end",
+        sh(&format!("while [ ! -e {} ]; do sleep 0.02; done; exit 9", go.display())),
+    );
+    controller.wait_running("keep");
+    controller.wait_running("end");
+    let pid = agent.main_pid("keep", 1);
+    controller.set_away(true);
+    agent.kill();
+    agent.spawn();
+    std::fs::write(&go, "").unwrap();
+    until("the exit record", || agent.has_exit_record("end", 1).then_some(()));
+    controller.set_away(false);
+    assert_eq!(controller.wait_end("end").exit_code, Some(9));
+    assert!(lives(pid));
+    // What a complete set does not name is ended and forgotten.
+    controller.unassign("keep");
+    controller.set_away(true);
+    controller.set_away(false);
+    until("the task to go", || (!agent.task_dir("keep").exists()).then_some(()));
+    assert!(!lives(pid));
+}
+
+#[test]
+fn a_task_that_may_not_run_alone_ends_alone() {
+    let controller = Controller::start();
+    let mut agent = Agent::start(&controller);
+    let mut spec = sh("sleep 1000");
+    spec["onDisconnect"] = json!({ "policy": "Stop", "after": "1s" });
+    spec["restartPolicy"] = json!("Always");
+    controller.assign("tied", spec.clone());
+    controller.assign("free", sh("sleep 1000"));
+    controller.wait_running("tied");
+    controller.wait_running("free");
+    let (tied, free) = (agent.main_pid("tied", 1), agent.main_pid("free", 1));
+    // Heartbeats are answered for longer than the task may be alone: it lives.
+    let beats = controller.beats();
+    until("two seconds of heartbeats", || (controller.beats() > beats + 20).then_some(()));
+    assert!(lives(tied));
+    // The agent is frozen: only the shim can act.
+    // SAFETY: signals to a child of this test.
+    unsafe { libc::kill(agent.pid(), libc::SIGSTOP) };
+    until("the end by the shim", || (!lives(tied)).then_some(()));
+    assert!(lives(free));
+    // SAFETY: as above.
+    unsafe { libc::kill(agent.pid(), libc::SIGCONT) };
+    let end = controller.wait_end("tied");
+    assert_eq!((end.reason.as_str(), end.phase()), ("Disconnected", proto::TaskPhase::Failed));
+    // With the agent dead as well, and after its return nothing starts without contact.
+    controller.assign("tied2", spec);
+    controller.wait_running("tied2");
+    let tied = agent.main_pid("tied2", 1);
+    controller.set_away(true);
+    agent.kill();
+    until("the end by the shim", || (!lives(tied)).then_some(()));
+    agent.spawn();
+    controller.set_away(false);
+    assert_eq!(controller.wait_end("tied2").reason, "Disconnected");
+}
+
+#[test]
+fn an_unanswered_report_is_said_again() {
+    let controller = Controller::start();
+    let _agent = Agent::start(&controller);
+    controller.set_mute(true);
+    controller.assign("once", sh("exit 0"));
+    let end = controller.wait_end("once");
+    until("the same report again", || {
+        let same = controller.reports("once").into_iter().filter(|r| r.sequence == end.sequence);
+        (same.count() >= 2).then_some(())
+    });
+}
+
+#[test]
+fn a_task_ordered_to_stop_before_it_came_never_starts() {
+    let controller = Controller::start();
+    let agent = Agent::start(&controller);
+    controller.assign_with(proto::Assignment {
+        uid: "late".to_owned(),
+        spec: serde_json::to_vec(&sh("touch /dev/null")).unwrap(),
+        stop: Some(proto::Stop { grace_period_ms: 0, reason: "Deleted".to_owned() }),
+        ..proto::Assignment::default()
+    });
+    let end = controller.wait_end("late");
+    assert_eq!((end.attempt, end.reason.as_str()), (0, "Stopped"));
+    assert!(!agent.task_dir("late").join("attempts").exists());
+}

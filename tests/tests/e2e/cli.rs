@@ -1,0 +1,120 @@
+//! The command as people use it, against a real cluster: what it prints where, and its exit codes.
+
+use std::path::Path;
+use std::process::{Command, Output};
+
+use muster_api::phase::TaskPhase;
+use muster_tests::{AgentOptions, Cluster, cluster::binary};
+
+fn manifests() -> std::path::PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../manifests")
+}
+
+/// Runs `muster`; the exit code, what it wrote to stdout, and to stderr.
+fn muster(cluster: &Cluster, args: &[&str]) -> (i32, String, String) {
+    let output: Output = Command::new(binary("muster"))
+        .args(args)
+        .env("MUSTER_CONFIG", cluster.kubeconfig())
+        .env("NO_COLOR", "1")
+        .output()
+        .expect("muster starts");
+    let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
+    (output.status.code().expect("it was not killed"), text(&output.stdout), text(&output.stderr))
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn broken_manifests_store_nothing_and_say_where() {
+    let cluster = Cluster::start().await;
+    let dir = manifests().join("invalid");
+    for entry in std::fs::read_dir(&dir).expect("of the tree").flatten() {
+        let path = entry.path();
+        if path.extension().is_none_or(|e| e != "yaml") {
+            continue;
+        }
+        let (code, out, err) = muster(&cluster, &["apply", "-f", path.to_str().expect("text")]);
+        assert_eq!((code, out.as_str()), (5, ""), "{}: {err}", path.display());
+        // The golden text's lines carry only the file's name; the command says the path as given.
+        let golden =
+            std::fs::read_to_string(path.with_extension("txt")).expect("each has a golden text");
+        for line in golden.lines() {
+            let rest = line.split_once(".yaml").expect("a place").1;
+            assert!(err.contains(rest), "{} lacks {rest:?}: {err}", path.display());
+        }
+    }
+    let everything = ["get", "tasks,nodes", "-A", "-o", "name"];
+    assert_eq!(muster(&cluster, &everything).1, "");
+    let (_, namespaces, _) = muster(&cluster, &["get", "namespaces", "-o", "name"]);
+    assert_eq!(
+        namespaces, "namespace/default\n",
+        "the good document beside a bad one is not stored either"
+    );
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn from_plan_to_delete() {
+    let mut cluster = Cluster::start().await;
+    cluster.join(AgentOptions::robot("robot", 3.0, 4.0)).await;
+    let manifest = cluster.dir().join("drive.yaml");
+    let driver = |name: &str| {
+        format!(
+            "apiVersion: muster.dev/v1alpha1\nkind: Task\nmetadata: {{name: {name}}}\nspec:\n  gracePeriodSeconds: 0\n  \
+             placement: {{at: {{x: 0, y: 0}}, within: 10}}\n  resources: {{cpu: 100m, actuators: ['base:Drive']}}\n  \
+             run: {{process: {{command: [sh, -c, 'echo at the wheel; sleep 1000']}}}}\n"
+        )
+    };
+    std::fs::write(&manifest, format!("{}---\n{}", driver("first"), driver("second")))
+        .expect("writable");
+    let file = manifest.to_str().expect("text");
+
+    let (code, plan, _) = muster(&cluster, &["plan", "-f", file]);
+    assert_eq!(code, 1, "there is something to do: {plan}");
+    assert!(
+        plan.contains("first") && plan.contains("robot") && plan.contains("LeaseHeld"),
+        "{plan}"
+    );
+    assert_eq!(muster(&cluster, &["get", "tasks", "-o", "name"]).1, "", "a plan changes nothing");
+
+    let (code, out, err) = muster(&cluster, &["apply", "-f", file]);
+    assert_eq!((code, out.as_str()), (0, "task/first created\ntask/second created\n"), "{err}");
+    let (code, out, _) = muster(&cluster, &["apply", "-f", file]);
+    assert_eq!((code, out.as_str()), (0, "task/first unchanged\ntask/second unchanged\n"));
+    assert_eq!(muster(&cluster, &["plan", "-f", file]).0, 0, "nothing to do");
+
+    let (code, _, err) =
+        muster(&cluster, &["wait", "task/first", "--for", "phase=Running", "--timeout", "60s"]);
+    assert_eq!(code, 0, "{err}");
+    cluster.task("second", "refused", |s| !s.why.is_empty()).await;
+    let (_, why, _) = muster(&cluster, &["why", "task/second"]);
+    assert!(
+        why.contains("robot") && why.contains("LeaseHeld") && why.contains("default/first"),
+        "{why}"
+    );
+    let (_, table, _) = muster(&cluster, &["get", "tk"]);
+    let row = table.lines().find(|l| l.starts_with("first")).expect("a row");
+    assert!(
+        row.contains("Running")
+            && row.contains("robot")
+            && row.contains("5.0")
+            && row.contains("AR-CR"),
+        "{table}"
+    );
+    let (_, described, _) = muster(&cluster, &["describe", "node", "robot"]);
+    assert!(described.contains("kinect:ImageGen") && described.contains("first"), "{described}");
+    assert_eq!(muster(&cluster, &["logs", "first"]).1, "at the wheel\n");
+
+    assert_eq!(muster(&cluster, &["get", "task", "none"]).0, 3, "not found");
+    assert_eq!(muster(&cluster, &["delete", "task", "first"]).0, 0);
+    cluster.phase("second", TaskPhase::Running).await;
+    let (code, _, err) = muster(&cluster, &["delete", "-f", file]);
+    assert_eq!(code, 3, "one of them is gone already: {err}");
+    assert_eq!(muster(&cluster, &["get", "tasks", "-o", "name"]).1, "");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_controller_that_is_not_there_is_said_with_the_next_step() {
+    let mut cluster = Cluster::start().await;
+    cluster.kill_controller();
+    let (code, out, err) = muster(&cluster, &["get", "nodes"]);
+    assert_eq!((code, out.as_str()), (6, ""), "{err}");
+    assert!(err.contains("https://127.0.0.1:") && err.contains("kubeconfig"), "{err}");
+}
