@@ -39,7 +39,7 @@ pub(super) fn choose(target: &Target, unit_cost: f64) -> Choice {
     };
     let max = target.max_rate.unwrap_or(f64::INFINITY);
     let unit_cost = unit_cost.max(1e-7);
-    let least = (load / (max * unit_cost)).ceil().clamp(1.0, MAX_UNITS);
+    let least = (load / (HEADROOM * max * unit_cost)).ceil().clamp(1.0, MAX_UNITS);
     let units = target.units.unwrap_or(least as u32).max(1);
     let wanted = load / (unit_cost * f64::from(units));
     let rate = wanted.max(target.min_rate).min(max);
@@ -48,15 +48,18 @@ pub(super) fn choose(target: &Target, unit_cost: f64) -> Choice {
     Choice { rate: Some(rate), units, reachable }
 }
 
-/// Part of a new measurement of the cost that is believed. A window is a second, so a change of the
-/// cost (a bigger map, a colder cache) is followed within about four.
-const BELIEF: f64 = 0.4;
-/// Part of the cpu time owed that is made good in a second: within about four, so that a mean over ten is
-/// right, and without a burst after one bad second of the machine.
-const REPAY: f64 = 0.25;
+/// Part of a new measurement of the cost that is believed. A correction comes five times a second, so
+/// a change of the cost (a bigger map, a colder cache) is followed within a second, and one frame that
+/// the machine interrupted is not.
+const BELIEF: f64 = 0.2;
+/// Part of the cpu time owed that is made good in a second. The sum of what is owed is exact, so a mean
+/// over a few seconds is right however noisy single frames are.
+const REPAY: f64 = 1.0;
 /// Most that is ever owed, as seconds of the share: after a long starvation nobody wants the frames
 /// that were missed.
-const MOST_OWED: f64 = 1.0;
+const MOST_OWED: f64 = 0.25;
+/// Part of the fastest rate that is planned with; the rest is room for corrections.
+const HEADROOM: f64 = 0.8;
 
 /// Holds the share of a core.
 #[derive(Debug, Clone)]
@@ -110,8 +113,8 @@ mod tests {
     fn the_rate_makes_the_share() {
         assert_eq!(choose(&LASER, 0.0153), Choice { rate: Some(10.0), units: 1, reachable: true });
         let fast = choose(&LASER, 0.001);
-        assert_eq!(fast.units, 4, "a fast machine gets more work a frame, not a faster laser");
-        assert!((fast.rate.unwrap() * 4.0 * 0.001 - 0.153).abs() < 1e-12);
+        assert_eq!(fast.units, 5, "a fast machine gets more work a frame, not a faster laser");
+        assert!((fast.rate.unwrap() * 5.0 * 0.001 - 0.153).abs() < 1e-12);
     }
 
     #[test]

@@ -77,6 +77,8 @@ impl Pacing {
 
 /// A second is long enough for a mean and short enough to watch.
 const WINDOW: Duration = Duration::from_secs(1);
+/// How often the rate is corrected: some frames, so that a mean over a few seconds is already right.
+const CORRECTION: Duration = Duration::from_millis(200);
 /// Latencies of this many windows make the percentiles.
 const LATENCY_WINDOWS: usize = 10;
 
@@ -202,6 +204,7 @@ impl Window {
 impl<W: Work> Loop<W> {
     fn run(mut self) {
         let mut window = Window::new();
+        let mut correction = Window::new();
         let mut totals = Totals::default();
         let mut next = Instant::now();
         loop {
@@ -213,6 +216,7 @@ impl<W: Work> Loop<W> {
             self.work.frame();
             let now = Instant::now();
             window.frames += 1;
+            correction.frames += 1;
             window.latencies.push(now.saturating_duration_since(due).as_secs_f64());
             next = match self.choice.rate {
                 None => now,
@@ -225,12 +229,23 @@ impl<W: Work> Loop<W> {
                     due + period + period.mul_f64(dropped)
                 }
             };
+            if now.duration_since(correction.begin) >= CORRECTION {
+                self.correct(&std::mem::replace(&mut correction, Window::new()));
+            }
             if now.duration_since(window.begin) >= WINDOW {
                 let old = std::mem::replace(&mut window, Window::new());
                 self.close(old, &mut totals);
             }
         }
         self.close(window, &mut totals);
+    }
+
+    fn correct(&mut self, window: &Window) {
+        let wall = window.begin.elapsed().as_secs_f64();
+        let cpu = cpu_time().saturating_sub(window.cpu).as_secs_f64();
+        if let Some(governor) = &mut self.governor {
+            self.choice.rate = Some(governor.after(wall, cpu, window.frames));
+        }
     }
 
     fn close(&mut self, window: Window, totals: &mut Totals) {
@@ -240,9 +255,6 @@ impl<W: Work> Loop<W> {
             return;
         }
         totals.add(&window);
-        if let Some(governor) = &mut self.governor {
-            self.choice.rate = Some(governor.after(wall, cpu, window.frames));
-        }
         let per_second = |n: u64| n as f64 / wall;
         let (p50, p99) = totals.percentiles();
         let mut line = json!({

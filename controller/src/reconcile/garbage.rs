@@ -47,9 +47,7 @@ impl Graph {
             return;
         }
         self.live.insert(stored.uid.clone(), stored.key.clone());
-        // Most objects have neither; looking for the words spares reading the JSON.
-        let mentions = |word: &[u8]| stored.bytes.windows(word.len()).any(|w| w == word);
-        if mentions(b"\"ownerReferences\"") {
+        if stored.mentions("ownerReferences") {
             let owners = owner_uids(&stored.value());
             for owner in &owners {
                 self.dependents.entry(owner.clone()).or_default().insert(stored.key.clone());
@@ -58,9 +56,8 @@ impl Graph {
                 self.owners.insert(stored.key.clone(), owners);
             }
         }
-        if mentions(b"\"deletionTimestamp\"")
-            && (mentions(FOREGROUND.as_bytes()) || mentions(ORPHAN.as_bytes()))
-        {
+        let waits = || stored.mentions(FOREGROUND) || stored.mentions(ORPHAN);
+        if stored.mentions("deletionTimestamp") && waits() {
             self.waiting.insert(stored.key.clone(), stored.uid.clone());
         }
     }

@@ -18,7 +18,7 @@ use k8s_openapi::apimachinery::pkg::apis::meta::v1::MicroTime;
 use muster_api::id::TaskUid;
 use muster_api::kind::lease::{Lease, LeaseHolder, LeaseSpec, LeaseStatus};
 use muster_api::kind::node::Node;
-use muster_api::kind::task::{NodeRefusal, Task, TaskLease, TaskSpec};
+use muster_api::kind::task::{NodeRefusal, Task, TaskLease, TaskSpec, TaskStatus};
 use muster_api::name::NodeName;
 use muster_api::phase::TaskPhase;
 use muster_api::pose::Pose;
@@ -337,29 +337,32 @@ impl Scheduler {
         retry
     }
 
-    /// The bind as one transaction. None: the stored task does not read as one.
+    /// The bind as one transaction. None: it does not wait any more.
     fn bind_ops(&self, bind: &Bind) -> Option<Vec<Op>> {
         let waiting = self.waiting.get(&bind.uid)?;
-        let mut task: Task = objects::read(&waiting.stored)?;
         let now = MicroTime(self.context.clock.now());
         let mut ops = Vec::with_capacity(2);
-        let status = task.status.get_or_insert_default();
-        status.phase = TaskPhase::Bound;
-        status.node = Some(bind.node.to_string());
-        status.score = bind.score;
-        status.why = Vec::new();
-        status.reason = String::new();
-        status.message = String::new();
-        status.bound_at = Some(now.clone());
-        status.lease = bind.leases.first().map(|(group, epoch)| TaskLease {
-            name: LeaseSpec::object_name(bind.node.as_str(), group),
-            epoch: *epoch,
-        });
-        ops.push(objects::replace(&waiting.stored, &task));
+        // A task that waits has nothing in its status but why it does; so the status is made anew, and
+        // the rest of the object is not read into types and back.
+        let status = TaskStatus {
+            phase: TaskPhase::Bound,
+            node: Some(bind.node.to_string()),
+            score: bind.score,
+            bound_at: Some(now.clone()),
+            lease: bind.leases.first().map(|(group, epoch)| TaskLease {
+                name: LeaseSpec::object_name(bind.node.as_str(), group),
+                epoch: *epoch,
+            }),
+            ..TaskStatus::default()
+        };
+        let mut value = waiting.stored.value();
+        value["status"] = objects::to_value(&status);
+        let key = waiting.stored.key.clone();
+        ops.push(Op::replace(key.clone(), value, waiting.stored.revision));
         for (group, epoch) in &bind.leases {
             let holder = LeaseHolder {
-                namespace: task.metadata.namespace.clone().unwrap_or_default(),
-                name: task.metadata.name.clone().unwrap_or_default(),
+                namespace: key.namespace().unwrap_or_default().to_owned(),
+                name: key.name.to_string(),
                 uid: bind.uid.clone(),
             };
             let status = LeaseStatus {

@@ -101,7 +101,9 @@ impl Board {
 
     fn take_in(&self, change: Change, stored: &Stored) {
         let uid = TaskUid::new(&*stored.uid);
-        let task = (change == Change::Put).then(|| objects::read::<Task>(stored)).flatten();
+        // A task that was never placed is not read: there may be thousands that wait.
+        let read = change == Change::Put && stored.mentions("boundAt");
+        let task = read.then(|| objects::read::<Task>(stored)).flatten();
         let placed = task.and_then(|task| {
             let node = NodeName::new(task.status.as_ref()?.node.clone()?).ok()?;
             Some((node, assignment(&task)))

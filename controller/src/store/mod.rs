@@ -66,6 +66,21 @@ pub struct Stored {
 }
 
 impl Stored {
+    /// Whether a field of this name can be in the object. A cheap look at the text, so that most objects
+    /// need not be read to see that they do not concern a caller; true may be a word of a value.
+    #[must_use]
+    pub fn mentions(&self, field: &str) -> bool {
+        let (field, bytes) = (field.as_bytes(), &self.bytes[..]);
+        let mut rest = bytes;
+        while let Some(quote) = rest.iter().position(|b| *b == b'"') {
+            rest = &rest[quote + 1..];
+            if rest.starts_with(field) && rest.get(field.len()) == Some(&b'"') {
+                return true;
+            }
+        }
+        false
+    }
+
     /// The object as a JSON tree.
     ///
     /// # Panics
