@@ -55,7 +55,9 @@ impl Rows {
             .journal_mode(SqliteJournalMode::Wal)
             .synchronous(SqliteSynchronous::Full);
         let mut connection = SqliteConnection::connect_with(&options).await.expect("SQLite");
-        for statement in ["DROP TABLE IF EXISTS rows", "CREATE TABLE rows(id INTEGER PRIMARY KEY, value TEXT)"] {
+        for statement in
+            ["DROP TABLE IF EXISTS rows", "CREATE TABLE rows(id INTEGER PRIMARY KEY, value TEXT)"]
+        {
             sqlx::query(statement).execute(&mut connection).await.expect("a new table");
         }
         Rows { connection, next: 0 }

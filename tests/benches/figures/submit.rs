@@ -39,15 +39,12 @@ async fn submit(cluster: &Cluster, name: &str, run: &Value) -> Duration {
     let begin = Instant::now();
     api.create(&PostParams::default(), &body).await.expect("taken");
     let running = loop {
-        match events.next().await.expect("the watch stays") {
-            Ok(WatchEvent::Added(task) | WatchEvent::Modified(task)) => {
-                let status = task.status.unwrap_or_default();
-                assert!(!status.phase.is_terminal(), "{status:?}");
-                if status.phase == TaskPhase::Running {
-                    break begin.elapsed();
-                }
-            }
-            _ => {}
+        let event = events.next().await.expect("the watch stays");
+        let Ok(WatchEvent::Added(task) | WatchEvent::Modified(task)) = event else { continue };
+        let status = task.status.unwrap_or_default();
+        assert!(!status.phase.is_terminal(), "{status:?}");
+        if status.phase == TaskPhase::Running {
+            break begin.elapsed();
         }
     };
     cluster.delete(name).await;

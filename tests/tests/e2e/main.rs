@@ -1,6 +1,7 @@
 //! The main job with real processes, cgroups, SQLite and Docker.
 
 mod cli;
+mod demo;
 mod figure4;
 mod lease;
 mod quotas;
