@@ -15,7 +15,7 @@
 //! | [`play`] | the course of events |
 //! | [`measure`] | counters of the kernel and lines of the workloads → shares and rates |
 //! | [`figures`], [`check`] | pure: rows, totals, what must hold |
-//! | [`print`] | what people and programs see |
+//! | [`mod@print`] | what people and programs see |
 
 mod api;
 mod check;

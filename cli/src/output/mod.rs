@@ -1,4 +1,4 @@
-//! What commands print. Data goes to standard output through [`Ui`], everything else to standard error.
+//! What commands print. Data goes to standard output through [`ui::Ui`], everything else to standard error.
 //!
 //! | module | holds |
 //! |---|---|

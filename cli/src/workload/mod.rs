@@ -10,7 +10,7 @@
 //! |---|---|
 //! | [`clock`] | cpu time of this process; SIGTERM as a flag one can wait for |
 //! | [`pace`] | pure: cost of a frame → rate and units; the slow correction |
-//! | [`run`] | the frame clock and its statistics |
+//! | [`mod@run`] | the frame clock and its statistics |
 //! | [`scene`], [`rng`] | camera frames; seeded randomness |
 //! | [`gmapping`], [`monitoring`], [`recognition`] | the three workloads of the paper's Fig. 2 and 5 |
 //! | [`training`] | what recognition's framework keeps in the cloud |

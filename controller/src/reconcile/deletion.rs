@@ -28,13 +28,19 @@ pub async fn run(context: Arc<Context>) {
 /// Looks at every task, then at what changes; ends when it must begin anew.
 async fn follow(context: &Context) -> Result<(), StoreError> {
     let mut watcher = watch_from_now(&context.store).await;
-    for stored in context.store.list(TASKS, None).items.iter().filter(|s| s.mentions("deletionTimestamp")) {
+    for stored in
+        context.store.list(TASKS, None).items.iter().filter(|s| s.mentions("deletionTimestamp"))
+    {
         consider(context, &stored.key).await?;
     }
     while let Some(events) = next_events(&mut watcher).await {
         let keys: BTreeSet<Key> = events
             .iter()
-            .filter(|e| e.change == Change::Put && e.object.key.resource == TASKS && e.object.mentions("deletionTimestamp"))
+            .filter(|e| {
+                e.change == Change::Put
+                    && e.object.key.resource == TASKS
+                    && e.object.mentions("deletionTimestamp")
+            })
             .map(|e| e.object.key.clone())
             .collect();
         for key in keys {
