@@ -63,6 +63,11 @@ async fn mark(context: &Context, sessions: &Sessions, node: NodeName, silence: D
         tracing::warn!(%node, error = crate::app::chain(&error), "a silent node is not marked yet");
         tokio::time::sleep(RETRY).await;
     }
+    // It came back while a write of ours was on its way to the disk, so something may say "silent" of a
+    // node that is there. Only a new Hello tells everything anew.
+    if sessions.is_heard(&node) {
+        sessions.kick(&node);
+    }
 }
 
 async fn mark_once(

@@ -27,18 +27,25 @@ use muster_controller_core::ledger::Reservation;
 use muster_controller_core::schedule::{self, Bind, Demand, Wait};
 use tokio::sync::{mpsc, oneshot};
 use tokio::time::Instant;
+use tokio_util::task::AbortOnDropHandle;
 
 use super::books::{Books, Page};
 use super::{RETRY, next_events, watch_from_now};
 use crate::context::Context;
 use crate::objects::{self, LEASES, NODES, TASKS};
-use crate::store::{Change, Event, Key, Op, Stored, Watcher};
+use crate::store::{Change, Event, Key, Op, StoreError, Stored, Watcher};
 
 /// How often changed numbers in a waiting task's reasons are written. New reasons are written at
 /// once; a reason whose numbers move with every bind would write without end.
 const WHY_EVERY: Duration = Duration::from_secs(1);
 /// Reasons written in one pass, so that a thousand waiting tasks do not hold up the next bind.
 const WHY_AT_ONCE: usize = 256;
+
+/// Binds that are rendered at once. Rendering one takes some tens of microseconds and a commit some
+/// milliseconds: a few hundred keep both the disk and this task busy.
+const CHUNK: usize = 256;
+
+type Committed = Result<Vec<Arc<Stored>>, StoreError>;
 
 /// A question to the scheduler.
 #[derive(Debug)]
@@ -299,16 +306,7 @@ impl Scheduler {
     }
 
     async fn bind_all(&mut self, binds: Vec<Bind>) -> Option<Instant> {
-        let transactions: Vec<Option<Vec<Op>>> =
-            binds.iter().map(|bind| self.bind_ops(bind)).collect();
-        let store = &self.context.store;
-        let apply = |ops: Option<Vec<Op>>| async move {
-            match ops {
-                Some(ops) => Some(store.apply(ops).await),
-                None => None,
-            }
-        };
-        let results = join_all(transactions.into_iter().map(apply)).await;
+        let results = self.commit(&binds).await;
         let mut retry = None;
         for (bind, result) in binds.into_iter().zip(results) {
             match result {
@@ -335,6 +333,34 @@ impl Scheduler {
             self.dirty.insert(bind.node);
         }
         retry
+    }
+
+    /// Carries binds out, each as a transaction of its own; the results are in the same order. None: the
+    /// task does not wait any more. While one chunk is on its way to the disk the next is rendered.
+    async fn commit(&self, binds: &[Bind]) -> Vec<Option<Committed>> {
+        let mut chunks = Vec::with_capacity(binds.len().div_ceil(CHUNK));
+        for chunk in binds.chunks(CHUNK) {
+            let transactions: Vec<Option<Vec<Op>>> =
+                chunk.iter().map(|bind| self.bind_ops(bind)).collect();
+            let store = self.context.store.clone();
+            let apply = async move {
+                let apply = |ops: Option<Vec<Op>>| async { Some(store.apply(ops?).await) };
+                join_all(transactions.into_iter().map(apply)).await
+            };
+            if binds.len() <= CHUNK {
+                return apply.await;
+            }
+            chunks.push(AbortOnDropHandle::new(tokio::spawn(apply)));
+        }
+        let mut results = Vec::with_capacity(binds.len());
+        for chunk in chunks {
+            results.extend(
+                chunk
+                    .await
+                    .expect("a commit does not panic, and nobody aborts it while this waits"),
+            );
+        }
+        results
     }
 
     /// The bind as one transaction. None: it does not wait any more.

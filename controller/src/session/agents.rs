@@ -151,8 +151,10 @@ impl Session {
             replaced: replaced.clone(),
         };
         self.sessions.connect(&self.node, connection);
-        self.take_node(&speaker, hello.state.as_ref()).await?;
+        // Heard before it is written that it is ready: whoever is about to write that it is silent looks
+        // at this again, and must not overwrite the newer word with the older one.
         self.sessions.heard(&self.node);
+        self.take_node(&speaker, hello.state.as_ref()).await?;
         for report in &hello.tasks {
             self.apply_report(report).await?;
         }

@@ -162,6 +162,13 @@ impl Sessions {
         }
     }
 
+    /// Ends the session of a node, if there is one: the agent dials again and says everything anew.
+    pub fn kick(&self, node: &NodeName) {
+        if let Some(connection) = self.connection(node) {
+            connection.replaced.cancel();
+        }
+    }
+
     /// A session has ended. A later one of the same node stays.
     pub(crate) fn disconnect(&self, node: &NodeName, id: u64) {
         let mut connections = lock(&self.connections);

@@ -1,0 +1,239 @@
+//! What no Task may be, and what of one may not change.
+
+use serde_json::Value;
+
+use super::{
+    Cost, DisconnectPolicy, EnvVar, MAX_GRACE_SECONDS, NodeChoice, OnDisconnect, Resources, Run,
+    TaskSpec, TolerationOperator,
+};
+use crate::name::check_name;
+use crate::quantity::{Bytes, MilliCpu};
+use crate::validate::{Violations, element_path, member_path};
+
+/// The rules beside those that the types hold.
+pub(super) fn rules(spec: &TaskSpec, violations: &mut Violations) {
+    placement_rules(spec, violations);
+    resource_rules(&spec.resources, violations);
+    run_rules(&spec.run, violations);
+    if spec.grace_period_seconds > MAX_GRACE_SECONDS {
+        let reason = format!(
+            "{} is more than the longest allowed, {MAX_GRACE_SECONDS}",
+            spec.grace_period_seconds
+        );
+        violations.invalid("spec.gracePeriodSeconds", reason);
+    }
+    if let Some(OnDisconnect { policy: DisconnectPolicy::Keep, after: Some(_) }) =
+        spec.on_disconnect
+    {
+        violations
+            .forbidden("spec.onDisconnect.after", "means nothing with the policy Keep")
+            .suggest("leave it out, or set policy: Stop");
+    }
+}
+
+fn placement_rules(spec: &TaskSpec, violations: &mut Violations) {
+    let placement = &spec.placement;
+    if let Some(within) = placement.within {
+        if !(within >= 0.0 && within.is_finite()) {
+            violations
+                .invalid("spec.placement.within", format!("{within} is not a radius in metres"));
+        }
+        if placement.at.is_none() {
+            violations
+                .required("spec.placement.at")
+                .suggest("`within` needs the position it is around: at: {x: 3.0, y: 4.0}");
+        }
+    }
+    if let Some(at) = &placement.at {
+        for (axis, value) in [("x", at.x), ("y", at.y), ("z", at.z)] {
+            if !value.is_finite() {
+                violations.invalid(
+                    format!("spec.placement.at.{axis}"),
+                    format!("{value} is not a number of metres"),
+                );
+            }
+        }
+    }
+    if placement.cost == Cost::TravelTime && placement.at.is_none() {
+        violations
+            .required("spec.placement.at")
+            .suggest("the cost TravelTime needs the position to travel to");
+    }
+    if placement.on == NodeChoice::Cloud && !spec.resources.is_compute_only() {
+        violations
+            .invalid(
+                "spec.placement.on",
+                "a Cloud node has no sensors or actuators, and the task asks for some",
+            )
+            .suggest("set on: Robot");
+    }
+    if let Some(node) = &placement.node
+        && let Err(error) = check_name(node)
+    {
+        violations.invalid("spec.placement.node", error.to_string());
+    }
+    placement.selector.validate("spec.placement.selector", violations);
+    for (i, toleration) in placement.tolerations.iter().enumerate() {
+        let path = element_path("spec.placement.tolerations", i);
+        if toleration.key.is_empty() && toleration.operator == TolerationOperator::Equal {
+            violations
+                .required(format!("{path}.key"))
+                .suggest("or set operator: Exists to tolerate every taint");
+        }
+        if !toleration.value.is_empty() && toleration.operator == TolerationOperator::Exists {
+            violations.forbidden(format!("{path}.value"), "means nothing with the operator Exists");
+        }
+    }
+}
+
+/// Below this a memory limit kills any program while it starts; Docker refuses less, too.
+const MIN_MEMORY: Bytes = Bytes(6 << 20);
+/// The kernel gives no quota finer than 1 ms in a period of 100 ms.
+const MIN_CPU: MilliCpu = MilliCpu(10);
+
+fn resource_rules(resources: &Resources, violations: &mut Violations) {
+    if let Some(cpu) = resources.cpu.filter(|c| *c < MIN_CPU) {
+        violations
+            .invalid(
+                "spec.resources.cpu",
+                format!("{cpu} is less than the smallest quota, {MIN_CPU}"),
+            )
+            .suggest("leave it out to reserve nothing");
+    }
+    if let Some(memory) = resources.memory.filter(|m| *m < MIN_MEMORY) {
+        violations
+            .invalid(
+                "spec.resources.memory",
+                format!("{memory} is less than any program needs, {MIN_MEMORY}"),
+            )
+            .suggest(format!("did you mean {:?}?", format!("{}Mi", memory.0.max(6))));
+    }
+    if resources.pids == Some(0) {
+        violations.invalid("spec.resources.pids", "0 lets nothing run");
+    }
+    if let Some(io) = &resources.io {
+        for (field, limit) in [("readBps", io.read_bps), ("writeBps", io.write_bps)] {
+            if limit == Some(Bytes(0)) {
+                violations
+                    .invalid(format!("spec.resources.io.{field}"), "0 lets nothing through")
+                    .suggest("leave it out for no limit");
+            }
+        }
+    }
+    for (field, functions) in [("sensors", &resources.sensors), ("actuators", &resources.actuators)]
+    {
+        for (i, function) in functions.iter().enumerate() {
+            if functions[..i].contains(function) {
+                violations.duplicate(
+                    element_path(&member_path("spec.resources", field), i),
+                    format!("{:?} is there twice", function.to_string()),
+                );
+            }
+        }
+    }
+}
+
+fn run_rules(run: &Run, violations: &mut Violations) {
+    match (&run.container, &run.process) {
+        (None, None) => {
+            violations.required("spec.run").suggest("give `container` or `process`");
+        }
+        (Some(_), Some(_)) => {
+            violations
+                .forbidden("spec.run", "has both `container` and `process`")
+                .suggest("keep one of them");
+        }
+        (Some(container), None) => {
+            if container.image.trim().is_empty() {
+                violations.required("spec.run.container.image");
+            }
+            env_rules(&container.env, "spec.run.container.env", violations);
+            absolute("spec.run.container.workingDir", container.working_dir.as_deref(), violations);
+            for (i, mount) in container.mounts.iter().enumerate() {
+                let path = element_path("spec.run.container.mounts", i);
+                absolute(&format!("{path}.hostPath"), Some(&mount.host_path), violations);
+                absolute(&format!("{path}.mountPath"), Some(&mount.mount_path), violations);
+            }
+        }
+        (None, Some(process)) => {
+            if process.command.first().is_none_or(|c| c.is_empty()) {
+                violations
+                    .required("spec.run.process.command")
+                    .suggest("for example [\"/usr/bin/env\"]");
+            }
+            env_rules(&process.env, "spec.run.process.env", violations);
+            absolute("spec.run.process.workingDir", process.working_dir.as_deref(), violations);
+        }
+    }
+}
+
+fn absolute(path: &str, given: Option<&str>, violations: &mut Violations) {
+    if let Some(given) = given.filter(|g| !g.starts_with('/')) {
+        violations
+            .invalid(path, format!("{given:?} is not an absolute path"))
+            .suggest("begin it with '/'");
+    }
+}
+
+fn env_rules(env: &[EnvVar], path: &str, violations: &mut Violations) {
+    for (i, var) in env.iter().enumerate() {
+        let path = format!("{}.name", element_path(path, i));
+        if var.name.is_empty() || var.name.contains(['=', '\0']) {
+            violations.invalid(&path, format!("{:?} is not the name of a variable", var.name));
+        }
+        if env[..i].iter().any(|v| v.name == var.name) {
+            violations.duplicate(path, format!("{:?} is there twice", var.name));
+        }
+    }
+}
+
+/// What of a spec may change while the task exists: nothing that would need another process.
+const MUTABLE: [&str; 2] = ["priority", "gracePeriodSeconds"];
+
+/// What may not change while the task exists.
+pub(super) fn change_rules(old: &Value, new: &Value, violations: &mut Violations) {
+    let empty = serde_json::Map::new();
+    let spec =
+        |object: &Value| object.get("spec").and_then(Value::as_object).cloned().unwrap_or_default();
+    let (mut old, mut new) = (spec(old), spec(new));
+    for spec in [&mut old, &mut new] {
+        spec.retain(|key, _| !MUTABLE.contains(&key.as_str()));
+        if let Some(placement) = spec.get_mut("placement").and_then(Value::as_object_mut) {
+            placement.remove("tolerations");
+        }
+    }
+    differences(&Value::Object(old), &Value::Object(new), "spec", &empty, violations);
+}
+
+/// Names the deepest fields that differ, so that the message points at what was changed.
+fn differences(
+    old: &Value,
+    new: &Value,
+    path: &str,
+    empty: &serde_json::Map<String, Value>,
+    violations: &mut Violations,
+) {
+    if old == new {
+        return;
+    }
+    let as_members = |v: &Value| match v {
+        Value::Object(members) => Some(members.clone()),
+        Value::Null => Some(empty.clone()),
+        _ => None,
+    };
+    match (as_members(old), as_members(new)) {
+        (Some(a), Some(b)) if !(a.is_empty() && b.is_empty()) => {
+            let keys: std::collections::BTreeSet<&String> = a.keys().chain(b.keys()).collect();
+            for key in keys {
+                let null = Value::Null;
+                let (a, b) = (a.get(key).unwrap_or(&null), b.get(key).unwrap_or(&null));
+                differences(a, b, &member_path(path, key), empty, violations);
+            }
+        }
+        _ => {
+            violations
+                .forbidden(path, "cannot change while the task exists")
+                .suggest("delete the task and create it again; only priority, gracePeriodSeconds and placement.tolerations may change");
+        }
+    }
+}

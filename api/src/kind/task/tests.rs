@@ -1,0 +1,141 @@
+//! Admission of tasks, and the rules of their parts.
+
+use serde_json::{Value, json};
+
+use crate::kind::{admit, admit_change, find};
+
+use super::*;
+
+fn task(spec: Value) -> Value {
+    json!({"apiVersion": crate::API_VERSION, "kind": "Task", "metadata": {"name": "t"}, "spec": spec})
+}
+
+fn sleep(mut spec: Value) -> Value {
+    spec["run"] = json!({"process": {"command": ["sleep", "1"]}});
+    task(spec)
+}
+
+fn problems(object: &Value) -> Vec<String> {
+    match admit(object) {
+        Ok(_) => Vec::new(),
+        Err(violations) => violations.iter().map(ToString::to_string).collect(),
+    }
+}
+
+#[test]
+fn a_small_task_gets_its_defaults() {
+    let admitted =
+        admit(&sleep(json!({"resources": {"cpu": 0.5, "memory": "1073741824"}}))).expect("good");
+    assert_eq!(
+        admitted["spec"],
+        json!({
+            "priority": 0,
+            "placement": {"on": "Any", "cost": "Distance"},
+            "resources": {"cpu": "500m", "memory": "1Gi"},
+            "run": {"process": {"command": ["sleep", "1"]}},
+            "restartPolicy": "Never",
+            "gracePeriodSeconds": 10,
+        })
+    );
+    assert_eq!(admit(&admitted), Ok(admitted.clone()), "admission is idempotent");
+}
+
+#[test]
+fn exactly_one_program() {
+    assert_eq!(
+        problems(&task(json!({"run": {}}))),
+        ["spec.run: is required; give `container` or `process`"]
+    );
+    assert_eq!(
+        problems(&task(
+            json!({"run": {"container": {"image": "a"}, "process": {"command": ["a"]}}})
+        )),
+        ["spec.run: has both `container` and `process`; keep one of them"]
+    );
+    assert_eq!(
+        problems(&task(json!({"run": {"process": {"command": []}}}))),
+        ["spec.run.process.command: is required; for example [\"/usr/bin/env\"]"]
+    );
+}
+
+#[test]
+fn what_can_never_be_placed_is_refused() {
+    assert_eq!(
+        problems(&sleep(
+            json!({"placement": {"within": -1, "on": "Cloud"}, "resources": {"sensors": ["a:b", "a:b"]}})
+        )),
+        [
+            "spec.placement.within: -1 is not a radius in metres",
+            "spec.placement.at: is required; `within` needs the position it is around: at: {x: 3.0, y: 4.0}",
+            "spec.placement.on: a Cloud node has no sensors or actuators, and the task asks for some; set on: Robot",
+            "spec.resources.sensors[1]: \"a:b\" is there twice",
+        ]
+    );
+}
+
+#[test]
+fn only_priority_grace_and_tolerations_may_change() {
+    let info = find(crate::API_VERSION, "Task").expect("served");
+    let old = admit(&sleep(json!({"resources": {"cpu": 1}}))).expect("good");
+    let mut new = old.clone();
+    new["spec"]["priority"] = json!(5);
+    new["spec"]["gracePeriodSeconds"] = json!(1);
+    new["spec"]["placement"]["tolerations"] = json!([{"operator": "Exists"}]);
+    admit_change(info, &old, &new).expect("these may change");
+    new["spec"]["resources"]["cpu"] = json!("2");
+    new["spec"]["placement"]["node"] = json!("r1");
+    let paths: Vec<String> = admit_change(info, &old, &new)
+        .expect_err("these may not")
+        .iter()
+        .map(|v| v.path.clone())
+        .collect();
+    assert_eq!(paths, ["spec.placement.node", "spec.resources.cpu"]);
+}
+
+#[test]
+fn tolerations_match_as_in_kubernetes() {
+    let taint = |value: &str| Taint {
+        key: "battery".into(),
+        value: value.into(),
+        effect: TaintEffect::NoSchedule,
+    };
+    let toleration = |key: &str, operator, value: &str, effect| Toleration {
+        key: key.into(),
+        operator,
+        value: value.into(),
+        effect,
+    };
+    use TolerationOperator::{Equal, Exists};
+    for (t, tolerates) in [
+        (toleration("battery", Equal, "low", None), true),
+        (toleration("battery", Equal, "full", None), false),
+        (toleration("battery", Exists, "", None), true),
+        (toleration("", Exists, "", None), true),
+        (toleration("other", Exists, "", None), false),
+        (toleration("battery", Exists, "", Some(TaintEffect::PreferNoSchedule)), false),
+    ] {
+        assert_eq!(t.tolerates(&taint("low")), tolerates, "{t:?}");
+    }
+}
+
+#[test]
+fn a_task_with_actuators_stops_without_contact_unless_it_says_otherwise() {
+    let spec = |extra: Value| -> TaskSpec {
+        let mut full = json!({"run": {"process": {"command": ["a"]}}});
+        full.as_object_mut().expect("a map").extend(extra.as_object().expect("a map").clone());
+        serde_json::from_value(full).expect("a spec")
+    };
+    let drive = json!({"resources": {"actuators": ["base:Drive"]}});
+    assert_eq!(spec(json!({})).stop_after_disconnect(), None);
+    assert_eq!(spec(drive).stop_after_disconnect(), Some(DEFAULT_STOP_AFTER));
+    let stop = json!({"onDisconnect": {"policy": "Stop", "after": "5s"}});
+    assert_eq!(spec(stop).stop_after_disconnect(), Some(Span::from_secs(5)));
+}
+
+#[test]
+fn classes_are_written_as_in_the_paper() {
+    let class = |r: Value| serde_json::from_value::<Resources>(r).expect("resources").class();
+    assert_eq!(class(json!({"cpu": 1, "sensors": ["k:I"], "actuators": ["b:D"]})), "AR-CR-SR");
+    assert_eq!(class(json!({"sensors": ["k:I"]})), "SR");
+    assert_eq!(class(json!({})), "none");
+}
