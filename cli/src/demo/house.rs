@@ -1,7 +1,7 @@
 //! The processes of the demo and the directory that all of them write in.
 //!
 //! Order of the end: tasks (by deleting them, so that agents end them as they should), agents,
-//! controller, directory. Each step has a deadline, and what outlives it is killed: only processes that
+//! controller, control groups, directory. Each step has a deadline, and what outlives it is killed: only processes that
 //! this demo started, known by their pids or by the PATH that begins in the demo's own directory.
 
 use std::collections::BTreeSet;
@@ -17,7 +17,8 @@ use tokio::time::timeout;
 
 use super::DemoError;
 use super::api::Api;
-use super::scenario::NodePlan;
+use super::groups;
+use super::scenario::{NODES, NodePlan};
 use crate::error::CliError;
 
 /// A controller makes its certificates and its store, an agent joins: a second at most on a machine
@@ -105,7 +106,7 @@ impl House {
     }
 
     /// An error when a daemon has ended.
-    fn all_alive(&mut self) -> Result<(), DemoError> {
+    pub(super) fn all_alive(&mut self) -> Result<(), DemoError> {
         let daemons = self.controller.iter_mut().chain(&mut self.agents);
         let mut died = None;
         for daemon in daemons {
@@ -199,12 +200,17 @@ impl House {
         left
     }
 
-    /// Kills what is left of tasks and removes the directory.
+    /// Kills what is left of tasks, and removes control groups and the directory.
     fn put_away(&mut self, left: &mut Vec<String>) {
         let Some(dir) = self.dir.take() else { return };
         let killed = kill_those_below(dir.path());
         if killed > 0 {
             left.push(format!("killed {killed} processes of tasks that had stayed"));
+        }
+        for group in NODES.iter().flat_map(|node| groups::of_agent(&dir.path().join(node.name))) {
+            if let Err(error) = remove_when_empty(&group) {
+                left.push(format!("the control group {} stays: {error}", group.display()));
+            }
         }
         if self.keep {
             left.push(format!("logs and data stay in {}", dir.keep().display()));
@@ -237,6 +243,17 @@ impl Daemon {
         }
         let _ = self.child.kill().await;
         false
+    }
+}
+
+/// A process that was killed just now is in its group until the kernel is done with it.
+fn remove_when_empty(group: &Path) -> std::io::Result<()> {
+    let begin = Instant::now();
+    loop {
+        match groups::remove(group) {
+            Err(_) if begin.elapsed() < Duration::from_secs(1) => std::thread::sleep(LOOK),
+            done => return done,
+        }
     }
 }
 

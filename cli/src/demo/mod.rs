@@ -10,6 +10,7 @@
 //! | module | holds |
 //! |---|---|
 //! | [`house`] | the processes and their directory; ends all of them, however the demo ends |
+//! | [`groups`] | the control groups that agents leave behind |
 //! | [`api`] | what is asked of the controller |
 //! | [`scenario`] | nodes and manifests, and the paper's figures |
 //! | [`play`] | the course of events |
@@ -20,6 +21,7 @@
 mod api;
 mod check;
 mod figures;
+mod groups;
 mod house;
 mod measure;
 mod play;
@@ -46,7 +48,7 @@ pub(crate) struct Args {
     #[arg(short, long, value_enum, default_value_t, value_name = "FORMAT")]
     output: Format,
     /// Seconds of each measurement
-    #[arg(long, value_name = "SECONDS", default_value_t = 7, value_parser = clap::value_parser!(u64).range(2..=600))]
+    #[arg(long, value_name = "SECONDS", default_value_t = 9, value_parser = clap::value_parser!(u64).range(2..=600))]
     measure: u64,
     /// Keep the directory with logs and data
     #[arg(long)]
@@ -105,6 +107,11 @@ async fn show(args: &Args, ui: &mut Ui) -> Result<u8, CliError> {
     let played = tokio::select! {
         played = play::play(args, &mut house, &mut out) => played,
         () = signals.next() => Ok(INTERRUPTED),
+    };
+    // A daemon that is gone is why nobody answers, and its log says more.
+    let played = match (played, house.all_alive()) {
+        (Err(CliError::Unreachable { .. }), Err(died)) => Err(died.into()),
+        (played, _) => played,
     };
     out.clear();
     if matches!(played, Ok(INTERRUPTED)) {

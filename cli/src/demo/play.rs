@@ -73,7 +73,7 @@ pub(super) async fn play(
     let quotas = play.nodes_join().await?;
     play.alone().await?;
     play.two().await?;
-    play.three().await?;
+    play.three(quotas.is_some()).await?;
     play.more().await?;
     play.look_at_the_books().await?;
     let mut report = play.report(quotas);
@@ -139,8 +139,9 @@ impl Play<'_, '_> {
     }
 
     /// Fig. 5 after 165 s.
-    async fn three(&mut self) -> Result<(), CliError> {
-        let mut tasks = self.start_all(&[WORKLOADS[2].task(), scenario::training()]).await?;
+    async fn three(&mut self, enforced: bool) -> Result<(), CliError> {
+        let training = scenario::training(enforced);
+        let mut tasks = self.start_all(&[WORKLOADS[2].task(), training]).await?;
         for workload in &WORKLOADS[..2] {
             tasks.extend(self.api.task(workload.name).await?);
         }

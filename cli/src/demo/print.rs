@@ -80,14 +80,7 @@ impl<'a> Out<'a> {
                 human::plain(why)
             )),
         };
-        self.say(&line)?;
-        if cfg!(debug_assertions) {
-            let text =
-                "this build is not optimised: frames are made cheap for it, and figures are coarse";
-            let text = self.ui.styles.warn.paint(text);
-            self.say(&text)?;
-        }
-        Ok(())
+        self.say(&line)
     }
 
     /// A node that has joined.

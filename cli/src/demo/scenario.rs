@@ -83,37 +83,7 @@ const SECOND_DRIVER: &str = include_str!("../../../manifests/examples/avalon/sec
 fn object(text: &str) -> Value {
     let documents = manifest::parse("embedded", text).unwrap_or_default();
     // A test parses all of them.
-    let mut object = documents.into_iter().next().map(|d| d.object).unwrap_or_default();
-    if cfg!(debug_assertions) {
-        lighten(&mut object);
-    }
-    object
-}
-
-/// Flags that make a frame some ten times cheaper. A build without optimisation needs as much more for a
-/// frame; with the manifests' sizes it would show a frame a second, and measure nothing.
-const LIGHT: [(&str, &str); 8] = [
-    ("--particles", "6"),
-    ("--beams", "60"),
-    ("--width", "160"),
-    ("--height", "120"),
-    ("--depth", "8"),
-    ("--size", "16"),
-    ("--batch", "4"),
-    ("--hidden", "16"),
-];
-
-fn lighten(task: &mut Value) {
-    let Some(args) = task.pointer_mut("/spec/run/process/args").and_then(Value::as_array_mut)
-    else {
-        return;
-    };
-    for i in 1..args.len() {
-        let light = LIGHT.iter().find(|(flag, _)| args[i - 1] == *flag);
-        if let Some((_, value)) = light {
-            args[i] = (*value).into();
-        }
-    }
+    documents.into_iter().next().map(|document| document.object).unwrap_or_default()
 }
 
 fn named(mut object: Value, name: &str) -> Value {
@@ -133,9 +103,16 @@ impl Workload {
     }
 }
 
-/// What recognition's framework keeps in the cloud.
-pub(super) fn training() -> Value {
-    object(TRAINING)
+/// What recognition's framework keeps in the cloud. It takes all the cpu that its quota leaves it; where
+/// nothing holds it to one it must hold itself, or it would take the robots' cpu on this same machine.
+pub(super) fn training(quotas_are_enforced: bool) -> Value {
+    let mut task = object(TRAINING);
+    if let Some(args) = task.pointer_mut("/spec/run/process/args").and_then(Value::as_array_mut)
+        && !quotas_are_enforced
+    {
+        args.extend(["--load".into(), "0.3".into()]);
+    }
+    task
 }
 
 /// What must wait for the lease.
@@ -176,7 +153,9 @@ mod tests {
             let load = (workload.paper_percent / 100.0).to_string();
             assert!(args.windows(2).any(|w| w == ["--load", load.as_str()]), "{args:?}");
         }
-        assert_eq!(read(training()).spec.resources.class(), "CR");
+        assert_eq!(read(training(true)).spec.resources.class(), "CR");
+        let args = read(training(false)).spec.run.process.expect("a process").args;
+        assert!(args.ends_with(&["--load".to_owned(), "0.3".to_owned()]), "{args:?}");
         assert_eq!(read(second_driver()).spec.resources.class(), "AR-CR");
         assert_eq!(read(more_monitoring(2)).metadata.name.as_deref(), Some("monitoring-2"));
     }
