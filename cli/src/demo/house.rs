@@ -42,6 +42,8 @@ pub(super) struct House {
     controller: Option<Daemon>,
     agents: Vec<Daemon>,
     api: Option<Api>,
+    /// The daemon that was found dead.
+    dead: Option<String>,
     keep: bool,
 }
 
@@ -61,7 +63,15 @@ impl House {
         fs::create_dir(&bin)
             .and_then(|()| std::os::unix::fs::symlink(&program, bin.join("muster")))
             .map_err(system("link this program"))?;
-        Ok(House { dir: Some(dir), program, controller: None, agents: Vec::new(), api: None, keep })
+        Ok(House {
+            dir: Some(dir),
+            program,
+            controller: None,
+            agents: Vec::new(),
+            api: None,
+            dead: None,
+            keep,
+        })
     }
 
     fn path(&self) -> &Path {
@@ -98,11 +108,13 @@ impl House {
         self.path().join(format!("{name}.log"))
     }
 
-    /// The last lines that a daemon wrote.
-    fn log_end(&self, name: &str) -> String {
+    /// The last lines of the daemon that was found dead.
+    pub(super) fn last_words(&self) -> Option<String> {
+        let name = self.dead.as_ref()?;
         let text = fs::read_to_string(self.log_path(name)).unwrap_or_default();
         let lines: Vec<&str> = text.lines().collect();
-        lines[lines.len().saturating_sub(LOG_LINES)..].join("\n")
+        let end = lines[lines.len().saturating_sub(LOG_LINES)..].join("\n  ");
+        Some(format!("the end of the {name}'s log:\n  {end}"))
     }
 
     /// An error when a daemon has ended.
@@ -115,7 +127,10 @@ impl House {
             }
         }
         match died {
-            Some(name) => Err(DemoError::Died { log: self.log_end(&name), name }),
+            Some(name) => {
+                self.dead = Some(name.clone());
+                Err(DemoError::Died { name })
+            }
             None => Ok(()),
         }
     }
@@ -187,7 +202,7 @@ impl House {
         if let Some(api) = self.api.take() {
             let ended = timeout(TASKS_LIMIT, end_tasks(&api)).await;
             if !matches!(ended, Ok(Ok(()))) {
-                left.push("tasks did not end in time; they are killed".to_owned());
+                left.push("tasks could not be ended in order; they are killed".to_owned());
             }
         }
         for daemon in self.agents.drain(..).chain(self.controller.take()) {

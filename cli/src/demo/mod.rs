@@ -74,8 +74,8 @@ pub(crate) enum DemoError {
     #[error("cannot {what}")]
     System { what: &'static str, source: std::io::Error },
     /// A daemon is not there any more.
-    #[error("the {name} ended by itself; the end of its log:\n{log}")]
-    Died { name: String, log: String },
+    #[error("the {name} ended by itself")]
+    Died { name: String },
     /// Something did not come in time.
     #[error("waited {} s for {what}", after.as_secs())]
     Late { what: String, after: Duration },
@@ -114,6 +114,9 @@ async fn show(args: &Args, ui: &mut Ui) -> Result<u8, CliError> {
         (played, _) => played,
     };
     out.clear();
+    if let Some(log) = house.last_words() {
+        out.note(&log);
+    }
     if matches!(played, Ok(INTERRUPTED)) {
         out.note("ending: tasks first, then agents, then the controller");
     }
@@ -126,22 +129,25 @@ async fn show(args: &Args, ui: &mut Ui) -> Result<u8, CliError> {
     played
 }
 
-/// SIGINT and SIGTERM.
-struct Signals(Signal, Signal);
+/// SIGINT, SIGTERM, and SIGHUP for a terminal that was closed.
+struct Signals([Signal; 3]);
 
 impl Signals {
     fn listen() -> Result<Self, DemoError> {
         let on = |kind| {
             signal(kind).map_err(|source| DemoError::System { what: "listen for signals", source })
         };
-        Ok(Signals(on(SignalKind::interrupt())?, on(SignalKind::terminate())?))
+        let (interrupt, terminate) = (SignalKind::interrupt(), SignalKind::terminate());
+        Ok(Signals([on(interrupt)?, on(terminate)?, on(SignalKind::hangup())?]))
     }
 
     /// Cancel-safe: a signal that was not waited for yet is kept.
     async fn next(&mut self) {
+        let [interrupt, terminate, hangup] = &mut self.0;
         tokio::select! {
-            _ = self.0.recv() => {}
-            _ = self.1.recv() => {}
+            _ = interrupt.recv() => {}
+            _ = terminate.recv() => {}
+            _ = hangup.recv() => {}
         }
     }
 }
