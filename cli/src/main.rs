@@ -24,7 +24,6 @@ mod output;
 mod session;
 mod target;
 mod watch;
-mod workload;
 
 use std::process::ExitCode;
 

@@ -22,7 +22,7 @@ pub(crate) enum Command {
     /// Show one robot shared by three workloads, with processes of this program alone
     Demo(crate::demo::Args),
     /// Run a program for robots: Avalon's workloads, and probes for tests
-    Workload(crate::workload::Args),
+    Workload(muster_workloads::Args),
     /// Print a completion script for a shell
     Completion(completion::Args),
 }
@@ -36,7 +36,7 @@ pub(crate) fn run(command: Command, ui: &mut Ui) -> Result<ExitCode, CliError> {
             Ok(muster_agent::run(*args, Reexec::this_binary(&[shim::VERB])))
         }
         Command::Demo(args) => crate::demo::run(&args, ui).map(ExitCode::from),
-        Command::Workload(args) => Ok(crate::workload::run(args).into()),
+        Command::Workload(args) => Ok(muster_workloads::run(args).into()),
         Command::Completion(args) => completion::run(&args, ui).map(ExitCode::from),
     }
 }

@@ -15,12 +15,14 @@
 //! | [`gmapping`], [`monitoring`], [`recognition`] | the three workloads of the paper's Fig. 2 and 5 |
 //! | [`training`] | what recognition's framework keeps in the cloud |
 //! | [`drive`] | another task that wants the base |
+//! | [`mod@exit`] | exit codes, the same as the command's |
 //! | [`probe`] | spin, allocate, ignore-term, exit, io |
 //!
 //! Everything random comes from `--seed`; only rates and latencies differ between runs.
 
 mod clock;
 mod drive;
+mod exit;
 mod gmapping;
 mod monitoring;
 mod pace;
@@ -33,7 +35,7 @@ mod training;
 
 /// Run a program for robots: Avalon's workloads, and probes for tests
 #[derive(Debug, clap::Args)]
-pub(crate) struct Args {
+pub struct Args {
     #[command(subcommand)]
     workload: Workload,
 }
@@ -63,7 +65,7 @@ enum Workload {
 }
 
 /// Runs it to its end, and returns the exit code. Blocks; needs no runtime of the caller's.
-pub(crate) fn run(args: Args) -> u8 {
+pub fn run(args: Args) -> u8 {
     match args.workload {
         Workload::Gmapping(args) => gmapping::run(&args),
         Workload::Monitoring(args) => monitoring::run(&args),

@@ -179,9 +179,9 @@ impl Grid {
 
 #[cfg(test)]
 mod tests {
-    use super::super::super::rng::Rng;
-    use super::super::world::World;
     use super::*;
+    use crate::gmapping::world::World;
+    use crate::rng::Rng;
 
     fn drawn() -> (World, Scan, Grid) {
         let world = World::rooms();

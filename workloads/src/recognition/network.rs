@@ -4,7 +4,7 @@
 //!
 //! Batch normalisation is folded into the weights, as it is for inference.
 
-use super::super::rng::Rng;
+use crate::rng::Rng;
 
 /// Classes of CIFAR-10, which this form was made for.
 const CLASSES: usize = 10;

@@ -1,7 +1,7 @@
 //! Rooms with walls, doors and pillars, and a laser in them.
 
-use super::super::rng::Rng;
 use super::{Pose, Scan};
+use crate::rng::Rng;
 
 /// How far the laser sees, m.
 pub(super) const MAX_RANGE: f64 = 6.0;

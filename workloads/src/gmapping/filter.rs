@@ -3,10 +3,10 @@
 
 use std::sync::Arc;
 
-use super::super::rng::Rng;
 use super::grid::Grid;
 use super::world::{Bounds, World};
 use super::{Pose, Scan};
+use crate::rng::Rng;
 
 /// Deviation of a step that the wheels report: part of the way, of the turn, and in any case.
 const WAY_DEVIATION: f64 = 0.08;

@@ -1,8 +1,8 @@
 //! A whole picture: colours apart (YCbCr, the chrominance at half the resolution), blocks, bits.
 
-use super::super::scene::Image;
 use super::bits::{Reader, Writer};
 use super::dct::{Block, Plane, Transform};
+use crate::scene::Image;
 
 /// Encodes and decodes at one quality.
 #[derive(Debug)]
@@ -149,8 +149,8 @@ pub(super) fn psnr(a: &Image, b: &Image) -> f64 {
 
 #[cfg(test)]
 mod tests {
-    use super::super::super::scene::Scene;
     use super::*;
+    use crate::scene::Scene;
 
     #[test]
     fn a_picture_comes_back_alike_and_was_small() {

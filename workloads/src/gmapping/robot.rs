@@ -1,8 +1,8 @@
 //! The robot as it is: a differential drive that explores by its laser alone.
 
-use super::super::rng::Rng;
 use super::world::World;
 use super::{Pose, Scan};
+use crate::rng::Rng;
 
 /// Seconds between two scans of simulated time.
 const PERIOD: f64 = 0.1;

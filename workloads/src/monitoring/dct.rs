@@ -100,8 +100,8 @@ impl Transform {
 
 #[cfg(test)]
 mod tests {
-    use super::super::super::rng::Rng;
     use super::*;
+    use crate::rng::Rng;
 
     #[test]
     fn there_and_back_is_the_same() {

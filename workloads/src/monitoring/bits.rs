@@ -115,8 +115,8 @@ impl<'a> Reader<'a> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::super::rng::Rng;
     use super::*;
+    use crate::rng::Rng;
 
     #[test]
     fn numbers_come_back() {
