@@ -2,13 +2,30 @@
 //!
 //! Service stubs are not made here: they need a transport, and this crate has none. The controller
 //! and the agent compile the same files for their own side of each service.
+//!
+//! The framework session also travels as JSON lines, so its messages have protobuf's JSON mapping (pbjson).
 
 use std::path::Path;
+
+use prost::Message as _;
+
+const FRAMEWORK: &str = ".muster.framework.v1";
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     let root = Path::new("proto");
     println!("cargo:rerun-if-changed=proto");
-    let files = protox::compile([root.join("muster/agent/v1/agent.proto")], [root])?;
-    tonic_prost_build::configure().build_client(false).build_server(false).compile_fds(files)?;
+    let package = |name: &str| root.join(format!("muster/{name}/v1/{name}.proto"));
+    let agent = protox::compile([package("agent")], [root])?;
+    let sessions = protox::compile([package("framework"), package("executor")], [root])?;
+    let plain = || tonic_prost_build::configure().build_client(false).build_server(false);
+    plain().compile_fds(agent)?;
+    plain()
+        .bytes(".")
+        .compile_well_known_types(true)
+        .extern_path(".google.protobuf", "::pbjson_types")
+        .compile_fds(sessions.clone())?;
+    pbjson_build::Builder::new()
+        .register_descriptors(&sessions.encode_to_vec())?
+        .build(&[FRAMEWORK])?;
     Ok(())
 }

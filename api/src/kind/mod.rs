@@ -2,9 +2,11 @@
 //! [`admit`] the one gate that an object passes before it is stored, in the client and the server.
 
 pub mod event;
+pub mod framework;
 pub mod lease;
 pub mod namespace;
 pub mod node;
+pub mod quota;
 pub mod task;
 
 use std::any::TypeId;
@@ -60,7 +62,15 @@ impl KindInfo {
 }
 
 /// Every kind, in the order they are listed to people.
-pub static ALL: &[KindInfo] = &[node::INFO, task::INFO, lease::INFO, namespace::INFO, event::INFO];
+pub static ALL: &[KindInfo] = &[
+    node::INFO,
+    task::INFO,
+    lease::INFO,
+    framework::INFO,
+    quota::INFO,
+    namespace::INFO,
+    event::INFO,
+];
 
 /// The kind with this `apiVersion` and `kind`.
 #[must_use]

@@ -232,7 +232,7 @@ pub struct IoLimits {
     pub write_bps: Option<Bytes>,
 }
 
-/// The program: exactly one of the two.
+/// The program: exactly one of the three.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "camelCase", deny_unknown_fields, default)]
 pub struct Run {
@@ -242,6 +242,22 @@ pub struct Run {
     /// A process of the node itself.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub process: Option<ProcessRun>,
+    /// Work that an executor does which runs on the node already.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub executor: Option<ExecutorRun>,
+}
+
+/// Work for an executor: a task of the same namespace that stays alive on the node and runs many tasks itself
+/// (Avalon, IV-B). The agent hands the work over by the executor's Unix socket, and the executor's limits grow by
+/// what this task reserves.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "camelCase", deny_unknown_fields)]
+pub struct ExecutorRun {
+    /// Name of the executor's Task.
+    pub task: String,
+    /// What the executor is told; the controller does not look into it.
+    #[serde(default, skip_serializing_if = "serde_json::Map::is_empty")]
+    pub data: serde_json::Map<String, serde_json::Value>,
 }
 
 /// A container.

@@ -3,8 +3,8 @@
 use serde_json::Value;
 
 use super::{
-    Cost, DisconnectPolicy, EnvVar, MAX_GRACE_SECONDS, NodeChoice, OnDisconnect, Resources, Run,
-    TaskSpec, TolerationOperator,
+    Cost, DisconnectPolicy, EnvVar, MAX_GRACE_SECONDS, NodeChoice, OnDisconnect, Resources,
+    RestartPolicy, Run, TaskSpec, TolerationOperator,
 };
 use crate::name::check_name;
 use crate::quantity::{Bytes, MilliCpu};
@@ -15,6 +15,11 @@ pub(super) fn rules(spec: &TaskSpec, violations: &mut Violations) {
     placement_rules(spec, violations);
     resource_rules(&spec.resources, violations);
     run_rules(&spec.run, violations);
+    if spec.run.executor.is_some() && spec.restart_policy != RestartPolicy::Never {
+        violations
+            .invalid("spec.restartPolicy", "an executor's work is not run again by itself")
+            .suggest("leave it out, or set Never");
+    }
     if spec.grace_period_seconds > MAX_GRACE_SECONDS {
         let reason = format!(
             "{} is more than the longest allowed, {MAX_GRACE_SECONDS}",
@@ -134,36 +139,51 @@ fn resource_rules(resources: &Resources, violations: &mut Violations) {
 }
 
 fn run_rules(run: &Run, violations: &mut Violations) {
-    match (&run.container, &run.process) {
-        (None, None) => {
+    let given: Vec<&str> = [
+        ("container", run.container.is_some()),
+        ("process", run.process.is_some()),
+        ("executor", run.executor.is_some()),
+    ]
+    .into_iter()
+    .filter_map(|(name, given)| given.then_some(name))
+    .collect();
+    match given.as_slice() {
+        [] => {
             violations.required("spec.run").suggest("give `container` or `process`");
         }
-        (Some(_), Some(_)) => {
+        [_] => {}
+        [first, second, ..] => {
             violations
-                .forbidden("spec.run", "has both `container` and `process`")
+                .forbidden("spec.run", format!("has both `{first}` and `{second}`"))
                 .suggest("keep one of them");
+            return;
         }
-        (Some(container), None) => {
-            if container.image.trim().is_empty() {
-                violations.required("spec.run.container.image");
-            }
-            env_rules(&container.env, "spec.run.container.env", violations);
-            absolute("spec.run.container.workingDir", container.working_dir.as_deref(), violations);
-            for (i, mount) in container.mounts.iter().enumerate() {
-                let path = element_path("spec.run.container.mounts", i);
-                absolute(&format!("{path}.hostPath"), Some(&mount.host_path), violations);
-                absolute(&format!("{path}.mountPath"), Some(&mount.mount_path), violations);
-            }
+    }
+    if let Some(container) = &run.container {
+        if container.image.trim().is_empty() {
+            violations.required("spec.run.container.image");
         }
-        (None, Some(process)) => {
-            if process.command.first().is_none_or(|c| c.is_empty()) {
-                violations
-                    .required("spec.run.process.command")
-                    .suggest("for example [\"/usr/bin/env\"]");
-            }
-            env_rules(&process.env, "spec.run.process.env", violations);
-            absolute("spec.run.process.workingDir", process.working_dir.as_deref(), violations);
+        env_rules(&container.env, "spec.run.container.env", violations);
+        absolute("spec.run.container.workingDir", container.working_dir.as_deref(), violations);
+        for (i, mount) in container.mounts.iter().enumerate() {
+            let path = element_path("spec.run.container.mounts", i);
+            absolute(&format!("{path}.hostPath"), Some(&mount.host_path), violations);
+            absolute(&format!("{path}.mountPath"), Some(&mount.mount_path), violations);
         }
+    }
+    if let Some(process) = &run.process {
+        if process.command.first().is_none_or(|c| c.is_empty()) {
+            violations
+                .required("spec.run.process.command")
+                .suggest("for example [\"/usr/bin/env\"]");
+        }
+        env_rules(&process.env, "spec.run.process.env", violations);
+        absolute("spec.run.process.workingDir", process.working_dir.as_deref(), violations);
+    }
+    if let Some(executor) = &run.executor
+        && let Err(error) = check_name(&executor.task)
+    {
+        violations.invalid("spec.run.executor.task", error.to_string());
     }
 }
 
