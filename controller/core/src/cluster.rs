@@ -5,11 +5,13 @@
 //! state twice changes nothing, so the scheduler's own writes may come back through the store.
 
 use std::cmp::Reverse;
-use std::collections::{BTreeSet, HashMap};
+use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::sync::Arc;
 
 use muster_api::id::{Epoch, TaskUid};
 use muster_api::kind::lease::DEFAULT_GROUP;
 use muster_api::kind::node::{Node, NodeKind, RuntimeStatus, Taint};
+use muster_api::kind::quota::QuotaSpec;
 use muster_api::name::{FunctionName, NodeName};
 use muster_api::pose::Pose;
 use muster_api::quantity::{Bytes, MilliCpu};
@@ -50,6 +52,27 @@ impl NodeFacts {
     pub fn groups_for(&self, actuators: &[FunctionName]) -> Vec<String> {
         if actuators.is_empty() { Vec::new() } else { vec![DEFAULT_GROUP.to_owned()] }
     }
+
+    /// Every conflict group of the robot; none when it has no actuators.
+    #[must_use]
+    pub fn groups(&self) -> Vec<String> {
+        if self.actuators.is_empty() { Vec::new() } else { vec![DEFAULT_GROUP.to_owned()] }
+    }
+
+    fn same_but_for_pose(&self, other: &NodeFacts) -> bool {
+        // Localized or not decides who is offered the robot, so it is more than a move.
+        let located = |f: &NodeFacts| f.pose.as_ref().map(|p| (p.map.clone(), p.localized));
+        self.kind == other.kind
+            && self.labels == other.labels
+            && self.unschedulable == other.unschedulable
+            && self.taints == other.taints
+            && self.speed == other.speed
+            && self.not_ready == other.not_ready
+            && self.sensors == other.sensors
+            && self.actuators == other.actuators
+            && located(self) == located(other)
+            && self.runtimes == other.runtimes
+    }
 }
 
 impl From<&Node> for NodeFacts {
@@ -83,6 +106,10 @@ pub struct Member {
     pub facts: Option<NodeFacts>,
     /// Its books.
     pub ledger: NodeLedger,
+    /// Grows with every change of facts or books; a robot that only moves keeps it.
+    pub version: u64,
+    /// Grows with every change of facts alone.
+    pub facts_version: u64,
     in_order: Option<FreeKey>,
 }
 
@@ -97,6 +124,9 @@ pub struct Cluster {
     placed: HashMap<TaskUid, Slot>,
     space: Space,
     by_free: BTreeSet<FreeKey>,
+    quotas: BTreeMap<Arc<str>, QuotaSpec>,
+    changed: BTreeSet<Slot>,
+    moved: BTreeSet<Slot>,
 }
 
 impl Cluster {
@@ -115,6 +145,8 @@ impl Cluster {
             name: name.clone(),
             facts: None,
             ledger: NodeLedger::default(),
+            version: 0,
+            facts_version: 0,
             in_order: None,
         });
         self.slots.insert(name.clone(), slot);
@@ -128,9 +160,18 @@ impl Cluster {
         let allocatable = node.status.as_ref().map(|s| s.allocatable.clone()).unwrap_or_default();
         self.index_pose(slot, facts.kind, facts.pose.as_ref());
         let member = &mut self.members[slot as usize];
+        // Our own writes of used and free come back as changes of the object that change nothing here.
+        let same = member.ledger.allocatable() == &allocatable
+            && member.facts.as_ref().is_some_and(|f| f.same_but_for_pose(&facts));
+        if member.facts.as_ref().is_none_or(|f| f.pose != facts.pose) {
+            self.moved.insert(slot);
+        }
         member.ledger.set_allocatable(allocatable);
         member.facts = Some(facts);
-        self.reorder(slot);
+        if !same {
+            member.facts_version += 1;
+            self.touch(slot);
+        }
     }
 
     /// A robot moved; poses come more often than Node objects change.
@@ -139,6 +180,7 @@ impl Cluster {
         let Some(facts) = self.members[slot as usize].facts.as_mut() else { return };
         facts.pose = Some(pose.clone());
         let kind = facts.kind;
+        self.moved.insert(slot);
         self.index_pose(slot, kind, Some(pose));
     }
 
@@ -154,15 +196,18 @@ impl Cluster {
         let Some(&slot) = self.slots.get(name) else { return };
         self.space.remove(slot);
         self.members[slot as usize].facts = None;
-        self.reorder(slot);
+        self.touch(slot);
     }
 
     /// Books a task that the store says is placed.
     pub fn book(&mut self, uid: &TaskUid, node: &NodeName, reservation: Reservation) {
         let slot = self.slot(node);
         self.placed.insert(uid.clone(), slot);
-        self.members[slot as usize].ledger.book(uid, reservation);
-        self.reorder(slot);
+        let ledger = &mut self.members[slot as usize].ledger;
+        if ledger.reservation(uid).is_none() {
+            ledger.book(uid, reservation);
+            self.touch(slot);
+        }
     }
 
     /// Reserves for a task by a decision of ours.
@@ -178,8 +223,17 @@ impl Cluster {
     ) -> Result<(), Denied> {
         self.members[slot as usize].ledger.reserve(uid, reservation)?;
         self.placed.insert(uid.clone(), slot);
-        self.reorder(slot);
+        self.touch(slot);
         Ok(())
+    }
+
+    /// Takes back a [`Cluster::reserve`] that nobody was told of; the node is as it was before, its version too.
+    pub fn undo(&mut self, uid: &TaskUid) {
+        let Some(slot) = self.placed.remove(uid) else { return };
+        let member = &mut self.members[slot as usize];
+        member.ledger.undo(uid);
+        member.version -= 1;
+        self.reorder(slot);
     }
 
     /// Takes in the present state of a Lease object.
@@ -191,7 +245,12 @@ impl Cluster {
         holder: Option<TaskUid>,
     ) {
         let slot = self.slot(node);
-        self.members[slot as usize].ledger.set_group(group, epoch, holder);
+        let ledger = &mut self.members[slot as usize].ledger;
+        let before = ledger.group(group);
+        ledger.set_group(group, epoch, holder);
+        if ledger.group(group) != before {
+            self.touch(slot);
+        }
     }
 
     /// Frees what a task holds; gives the node it was on, if it held anything.
@@ -200,8 +259,41 @@ impl Cluster {
         let member = &mut self.members[slot as usize];
         member.ledger.release(uid);
         let name = member.name.clone();
-        self.reorder(slot);
+        self.touch(slot);
         Some(name)
+    }
+
+    /// The node has changed in something that matters to offers.
+    fn touch(&mut self, slot: Slot) {
+        self.members[slot as usize].version += 1;
+        self.changed.insert(slot);
+        self.reorder(slot);
+    }
+
+    /// The nodes that changed since the last call, and those that only moved.
+    #[must_use = "they are told once"]
+    pub fn take_changes(&mut self) -> (BTreeSet<Slot>, BTreeSet<Slot>) {
+        (std::mem::take(&mut self.changed), std::mem::take(&mut self.moved))
+    }
+
+    /// Sets or removes what a namespace may have.
+    pub fn set_quota(&mut self, namespace: &str, quota: Option<QuotaSpec>) {
+        match quota {
+            Some(quota) => drop(self.quotas.insert(namespace.into(), quota)),
+            None => drop(self.quotas.remove(namespace)),
+        }
+    }
+
+    /// What a namespace may have; none: as much as there is, with weight 1.
+    #[must_use]
+    pub fn quota(&self, namespace: &str) -> Option<&QuotaSpec> {
+        self.quotas.get(namespace)
+    }
+
+    /// Whether any namespace has a quota.
+    #[must_use]
+    pub fn has_quotas(&self) -> bool {
+        !self.quotas.is_empty()
     }
 
     fn reorder(&mut self, slot: Slot) {
@@ -248,6 +340,11 @@ impl Cluster {
     /// Every node that has a Node object.
     pub fn members(&self) -> impl Iterator<Item = (Slot, &Member)> {
         (0_u32..).zip(&self.members).filter(|(_, m)| m.facts.is_some())
+    }
+
+    /// Every node, those included whose Node object is gone while tasks hold something there.
+    pub fn all(&self) -> impl Iterator<Item = &Member> {
+        self.members.iter()
     }
 
     /// Nodes of one kind, most free CR first.

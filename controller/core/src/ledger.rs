@@ -12,6 +12,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use muster_api::id::{Epoch, TaskUid};
+use muster_api::quantity::{Bytes, MilliCpu};
 use muster_api::resource::{Compute, Shortage};
 
 /// What one task holds of a node.
@@ -81,6 +82,19 @@ impl NodeLedger {
         let mut free = self.allocatable.clone();
         free.saturating_sub(&self.used);
         free
+    }
+
+    /// The cpu and memory of [`NodeLedger::free`].
+    #[must_use]
+    pub fn free_cpu_memory(&self) -> (MilliCpu, Bytes) {
+        let (all, used) = (&self.allocatable, &self.used);
+        (all.cpu.saturating_sub(used.cpu), all.memory.saturating_sub(used.memory))
+    }
+
+    /// Whether any conflict group has a holder.
+    #[must_use]
+    pub fn is_any_group_held(&self) -> bool {
+        self.groups.values().any(|g| g.holder.is_some())
     }
 
     /// The reservation of a task.
@@ -159,6 +173,14 @@ impl NodeLedger {
         }
     }
 
+    /// Takes a reservation back that nobody was told of: the epochs of its grants were never used.
+    pub fn undo(&mut self, uid: &TaskUid) {
+        for group in self.groups.values_mut().filter(|g| g.holder.as_ref() == Some(uid)) {
+            group.epoch = Epoch(group.epoch.0.saturating_sub(1));
+        }
+        self.release(uid);
+    }
+
     /// Frees what a task holds; groups it holds have no holder afterwards, their epochs stay.
     /// Says whether there was anything.
     pub fn release(&mut self, uid: &TaskUid) -> bool {
@@ -175,7 +197,6 @@ impl NodeLedger {
 
 #[cfg(test)]
 mod tests {
-    use muster_api::quantity::{Bytes, MilliCpu};
     use proptest::prelude::*;
 
     use super::*;

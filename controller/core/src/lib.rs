@@ -14,13 +14,19 @@
 //! | [`space`] | which robots are nearest, without a scan |
 //! | [`cluster`] | the nodes with their ledgers, and the orders in which they are tried |
 //! | [`schedule`] | where a task goes, or why it goes nowhere (invariant 6) |
+//! | [`offer`] | which frameworks are shown what, and whose Accept passes |
+//! | [`fairness`] | namespaces' shares and quotas |
 //! | [`node_health`] | when a node counts as lost |
 //! | [`report`] | typed reasons, with the words people read |
 #![deny(missing_docs)]
 
 pub mod cluster;
+pub mod fairness;
+#[cfg(test)]
+mod fixtures;
 pub mod ledger;
 pub mod node_health;
+pub mod offer;
 pub mod report;
 pub mod schedule;
 pub mod space;

@@ -37,6 +37,11 @@ pub enum Refusal {
         /// What the node says about it.
         message: String,
     },
+    /// The task is work for an executor that is not there.
+    NoExecutor {
+        /// Name of the executor's task.
+        task: String,
+    },
     /// The robot has no such sensor functions.
     NoSensor {
         /// Those it has not.
@@ -107,6 +112,7 @@ impl Refusal {
             Refusal::WrongKind { .. } => "WrongKind",
             Refusal::SelectorMismatch { .. } => "SelectorMismatch",
             Refusal::NoRuntime { .. } => "NoRuntime",
+            Refusal::NoExecutor { .. } => "NoExecutor",
             Refusal::NoSensor { .. } => "NoSensor",
             Refusal::NoActuator { .. } => "NoActuator",
             Refusal::TooSmall { .. } => "TooSmall",
@@ -168,7 +174,13 @@ impl fmt::Display for Refusal {
             Refusal::NoRuntime { runtime, message } => {
                 write!(f, "cannot run a {runtime} task: {message}")
             }
+            Refusal::NoExecutor { task } => {
+                write!(f, "does not run the executor {task}")
+            }
             Refusal::NoSensor { missing } => write!(f, "has no sensor {}", list(missing)),
+            Refusal::NoActuator { missing } if missing.is_empty() => {
+                f.write_str("has no actuators")
+            }
             Refusal::NoActuator { missing } => write!(f, "has no actuator {}", list(missing)),
             Refusal::TooSmall { shortage: s } => shortage(f, s, "is all the node has"),
             Refusal::Tainted { taint } => {

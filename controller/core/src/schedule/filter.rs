@@ -7,6 +7,7 @@ use muster_api::name::FunctionName;
 
 use super::Demand;
 use crate::cluster::{Member, NodeFacts};
+use crate::fairness::namespace_of;
 use crate::ledger::Denied;
 use crate::report::Refusal;
 
@@ -18,6 +19,7 @@ pub fn refusal(member: &Member, demand: &Demand) -> Option<Refusal> {
     };
     let spec = &*demand.spec;
     identity(member.name.as_str(), facts, spec)
+        .or_else(|| executor(member, demand))
         .or_else(|| abilities(facts, spec))
         .or_else(|| too_small(member, spec))
         .or_else(|| admission(facts, spec))
@@ -40,10 +42,19 @@ fn identity(name: &str, facts: &NodeFacts, spec: &TaskSpec) -> Option<Refusal> {
         .then(|| Refusal::SelectorMismatch { selector: placement.selector.to_string() })
 }
 
+/// Work for an executor goes where that executor is.
+fn executor(member: &Member, demand: &Demand) -> Option<Refusal> {
+    let task = &demand.spec.run.executor.as_ref()?.task;
+    let namespace = namespace_of(&demand.title);
+    let is_it = |title: &str| title.split_once('/') == Some((namespace, task.as_str()));
+    let here = member.ledger.reservations().any(|(_, r)| is_it(&r.title));
+    (!here).then(|| Refusal::NoExecutor { task: task.clone() })
+}
+
 fn abilities(facts: &NodeFacts, spec: &TaskSpec) -> Option<Refusal> {
     let runtime = if spec.run.container.is_some() { "docker" } else { "process" };
     let offered = facts.runtimes.iter().find(|r| r.name == runtime);
-    if !offered.is_some_and(|r| r.available) {
+    if spec.run.executor.is_none() && !offered.is_some_and(|r| r.available) {
         let message = offered.map(|r| r.message.clone()).unwrap_or_default();
         return Some(Refusal::NoRuntime { runtime, message });
     }

@@ -19,6 +19,7 @@ use muster_api::kind::task::{Cost, NodeRefusal, TaskSpec};
 use muster_api::name::NodeName;
 
 use crate::cluster::{Cluster, NodeFacts};
+use crate::fairness::{Accounts, OverQuota, namespace_of};
 use crate::ledger::Reservation;
 use crate::report::Refusal;
 use crate::space::Slot;
@@ -87,14 +88,27 @@ pub fn schedule(cluster: &mut Cluster, demands: &mut [Demand]) -> Plan {
     let mut plan = Plan::default();
     // A pass only takes, so what had no place for a task has none for one that asks the same.
     let mut hopeless: Vec<(Arc<TaskSpec>, Vec<NodeRefusal>)> = Vec::new();
+    let mut accounts = cluster.has_quotas().then(|| Accounts::of(cluster));
     for demand in demands.iter() {
+        if let Some(over) = accounts.as_ref().and_then(|a| over_quota(cluster, a, demand)) {
+            plan.waits.push(Wait { uid: demand.uid.clone(), why: vec![quota_refusal(&over)] });
+            continue;
+        }
         let known = hopeless.iter().find(|(spec, _)| asks_the_same(spec, &demand.spec));
         if let Some((_, why)) = known {
             plan.waits.push(Wait { uid: demand.uid.clone(), why: why.clone() });
             continue;
         }
         match choose(cluster, demand) {
-            Some(slot) => plan.binds.push(take(cluster, demand, slot)),
+            Some(slot) => {
+                let bind = take(cluster, demand, slot);
+                if let Some(accounts) = accounts.as_mut() {
+                    let compute = demand.spec.resources.reserved();
+                    let leases = bind.leases.len() as u64;
+                    accounts.add(namespace_of(&demand.title), &compute, leases);
+                }
+                plan.binds.push(bind);
+            }
             None => {
                 let why = summarise(explain(cluster, demand));
                 if hopeless.len() == HOPELESS_KEPT {
@@ -108,6 +122,25 @@ pub fn schedule(cluster: &mut Cluster, demands: &mut [Demand]) -> Plan {
     plan
 }
 
+/// What of its namespace's quota a task would pass.
+#[must_use]
+pub fn over_quota(cluster: &Cluster, accounts: &Accounts, demand: &Demand) -> Option<OverQuota> {
+    let resources = &demand.spec.resources;
+    // A robot's groups are known when it is chosen; a task takes at least one.
+    let leases = u64::from(!resources.actuators.is_empty());
+    accounts.over_quota(cluster, namespace_of(&demand.title), &resources.reserved(), leases)
+}
+
+/// The quota as a reason in a task's status.
+#[must_use]
+pub fn quota_refusal(over: &OverQuota) -> NodeRefusal {
+    NodeRefusal {
+        node: String::new(),
+        reason: "QuotaExceeded".to_owned(),
+        message: over.to_string(),
+    }
+}
+
 /// How many refused demands a pass remembers. Queues are mostly copies of a few templates; a longer
 /// memory would cost more in comparing than it saves in scanning.
 const HOPELESS_KEPT: usize = 8;
@@ -116,9 +149,11 @@ fn asks_the_same(a: &TaskSpec, b: &TaskSpec) -> bool {
     a.resources == b.resources
         && a.placement == b.placement
         && a.run.container.is_some() == b.run.container.is_some()
+        && a.run.executor.is_none()
+        && b.run.executor.is_none()
 }
 
-fn take(cluster: &mut Cluster, demand: &Demand, slot: Slot) -> Bind {
+pub(crate) fn take(cluster: &mut Cluster, demand: &Demand, slot: Slot) -> Bind {
     let member = cluster.at(slot);
     let facts = member.facts.as_ref().expect("a chosen node passed the filters, so it has facts");
     let (node, score) = (member.name.clone(), score::score(facts, &demand.spec));
@@ -244,7 +279,7 @@ pub fn explain(cluster: &Cluster, demand: &Demand) -> Vec<(NodeName, Refusal)> {
 /// What ends by itself comes first, what the task's owner must change last.
 fn hardness(refusal: &Refusal) -> u8 {
     match refusal {
-        Refusal::LeaseHeld { .. } | Refusal::Exhausted { .. } => 0,
+        Refusal::LeaseHeld { .. } | Refusal::Exhausted { .. } | Refusal::NoExecutor { .. } => 0,
         Refusal::OutOfRange { .. } | Refusal::NoPose | Refusal::NotLocalized => 1,
         Refusal::NotReady { .. } | Refusal::Cordoned | Refusal::Tainted { .. } => 2,
         Refusal::TooSmall { .. } | Refusal::NoRuntime { .. } | Refusal::NoSpeed => 3,

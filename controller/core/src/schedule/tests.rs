@@ -1,55 +1,13 @@
 //! Placement rules one by one, and that fast choice agrees with a scan over every node.
 
-use muster_api::condition::{self, Condition, ConditionStatus};
-use muster_api::kind::node::{Node, NodeSpec, NodeStatus, RuntimeStatus};
-use muster_api::pose::Pose;
-use muster_api::quantity::{Bytes, MilliCpu};
-use muster_api::resource::{Compute, parse_function_list};
+use muster_api::condition::ConditionStatus;
+use muster_api::kind::node::{Node, NodeStatus};
+use muster_api::quantity::MilliCpu;
 use proptest::prelude::*;
 use serde_json::json;
 
 use super::*;
-
-fn name(text: &str) -> NodeName {
-    NodeName::new(text).expect("a name")
-}
-
-fn node(kind: NodeKind, cpu: u64, at: Option<(f64, f64)>) -> Node {
-    let mut node =
-        Node::new("n", NodeSpec { kind, unschedulable: false, taints: Vec::new(), speed: None });
-    let robot = kind == NodeKind::Robot;
-    let functions = |text| parse_function_list(text).expect("functions").into_iter().collect();
-    node.status = Some(NodeStatus {
-        allocatable: Compute::new(MilliCpu(cpu), Bytes(1 << 30)),
-        sensors: if robot { functions("kinect:ImageGen,LaserGen") } else { Vec::new() },
-        actuators: if robot { functions("base:Drive;arm:Grasp") } else { Vec::new() },
-        pose: at.map(|(x, y)| Pose {
-            map: "map".to_owned(),
-            x,
-            y,
-            z: 0.0,
-            yaw: 0.0,
-            stamp: None,
-            source: String::new(),
-            localized: true,
-        }),
-        conditions: vec![Condition {
-            r#type: condition::READY.to_owned(),
-            status: ConditionStatus::True,
-            reason: String::new(),
-            message: String::new(),
-            last_transition_time: None,
-        }],
-        runtimes: vec![RuntimeStatus {
-            name: "process".to_owned(),
-            available: true,
-            version: String::new(),
-            message: String::new(),
-        }],
-        ..NodeStatus::default()
-    });
-    node
-}
+use crate::fixtures::{name, node};
 
 fn cluster(nodes: &[(&str, Node)]) -> Cluster {
     let mut cluster = Cluster::new();

@@ -1,0 +1,149 @@
+//! Offers: what of which node is shown to which framework (Avalon, III-C; Mesos for semantics).
+//!
+//! ```text
+//!   Cluster ── changed, moved ──▶ Book::refresh ──▶ Notices { rescinded, offered } ──▶ sessions
+//!   sessions ── decline, accept, … ──▶ Book ──▶ Verdict { binds } or a refusal
+//! ```
+//!
+//! | module | decides |
+//! |---|---|
+//! | [`allocator`] | which nodes a framework may be offered, best first: Algorithm 1 behind a trait |
+//! | [`book`] | which offers are out, when they end, what is refused until when |
+//! | [`settle`] | whether an Accept gets what it wants, and who goes first when several want the same |
+//!
+//! **Offers are optimistic.** Many frameworks may hold an offer of the same node; nothing is set aside for any of
+//! them, so a framework that does not answer delays nobody. What counts is the ledger at the moment of the Accept.
+//!
+//! **Offers are level-triggered.** After every [`Book::refresh`](book::Book::refresh) each framework that wants offers
+//! holds one for every node that it can be offered, up to its limit: nothing depends on having seen an event, and
+//! nobody is left out by the order of events (the property tests hold it against a scan over everything).
+
+pub mod allocator;
+pub mod book;
+pub mod settle;
+#[cfg(test)]
+mod tests;
+
+use std::fmt;
+use std::sync::Arc;
+use std::time::Duration;
+
+use muster_api::kind::framework::{FrameworkSpec, OfferFilter};
+use muster_api::kind::task::Cost;
+use muster_api::pose::OperationPosition;
+
+use crate::node_health::Monotonic;
+use crate::space::Slot;
+
+/// Number of an offer. It is never used again within one life of the controller.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct OfferId(pub u64);
+
+impl fmt::Display for OfferId {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}", self.0)
+    }
+}
+
+/// Number of a framework in the book, for as long as it is registered.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct Seat(pub u32);
+
+/// How long an offer waits for an answer. It costs nobody anything while it waits; the limit only ends what a
+/// forgotten framework would hold for ever, and keeps ages honest in `muster offers`.
+pub const EXPIRE_AFTER: Duration = Duration::from_secs(60);
+/// For how long an offer that ran out is not made again unless the node gains something: who did not answer in a
+/// minute will not in the next second.
+pub const REFUSED_BY_SILENCE: Duration = Duration::from_secs(5);
+/// For how long a decline holds when the framework names no time (Mesos' default).
+pub const DEFAULT_REFUSE: Duration = Duration::from_secs(5);
+/// How long contested Accepts are gathered. Frameworks that react to the same change answer within a few milliseconds
+/// of each other; longer would only slow the first one down.
+pub const GATHER: Duration = Duration::from_millis(5);
+/// For how long an offer that was rescinded because its node changed can still be accepted: the Accept may have been
+/// on its way. The ledger decides, as for any other.
+pub const IN_FLIGHT: Duration = Duration::from_secs(2);
+
+/// What a framework wants to be offered.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Wish {
+    /// Its namespace: whose share and quota count.
+    pub namespace: Arc<str>,
+    /// Where it works; none: everywhere, and offers have no score.
+    pub position: Option<OperationPosition>,
+    /// How far from there a robot may be, metres.
+    pub radius: f64,
+    /// How robots are scored.
+    pub cost: Cost,
+    /// What a node must have.
+    pub filter: OfferFilter,
+}
+
+impl Wish {
+    /// What a framework's spec says.
+    #[must_use]
+    pub fn new(namespace: &str, spec: &FrameworkSpec) -> Self {
+        Wish {
+            namespace: namespace.into(),
+            position: spec.position.clone(),
+            radius: spec.radius.unwrap_or(f64::INFINITY),
+            cost: spec.cost,
+            filter: spec.filter.clone(),
+        }
+    }
+}
+
+/// One node, shown to one framework.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Offer {
+    /// Its number.
+    pub id: OfferId,
+    /// The node.
+    pub slot: Slot,
+    /// Metres or seconds, by the framework's cost; none for a cloud node, or without a position.
+    pub score: Option<f64>,
+    /// When it was made.
+    pub made_at: Monotonic,
+    /// The node's version that it shows.
+    pub version: u64,
+}
+
+/// Why an offer ended without an answer.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum Rescinded {
+    /// The node has more, less or other things; a fresh offer follows where it still fits.
+    Changed,
+    /// An Accept used it.
+    Taken,
+    /// The robot is too far away, in another map, or does not know where it is.
+    OutOfRange,
+    /// The framework changed its filter or position, and the node does not fit any more.
+    Filtered,
+    /// The node is not ready, cordoned, tainted or gone.
+    NodeLost,
+    /// No answer came in time.
+    Expired,
+    /// The framework wants no offers.
+    Suppressed,
+    /// A closer robot takes its place.
+    Closer,
+    /// The namespace has no quota left.
+    Quota,
+}
+
+/// What a framework is to be told.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Notice {
+    /// Offers that ended.
+    pub rescinded: Vec<(OfferId, Rescinded)>,
+    /// New offers, best first.
+    pub offered: Vec<Offer>,
+}
+
+impl Notice {
+    /// Nothing to tell.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.rescinded.is_empty() && self.offered.is_empty()
+    }
+}
