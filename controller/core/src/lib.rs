@@ -14,6 +14,7 @@
 //! | [`space`] | which robots are nearest, without a scan |
 //! | [`cluster`] | the nodes with their ledgers, and the orders in which they are tried |
 //! | [`schedule`] | where a task goes, or why it goes nowhere (invariant 6) |
+//! | [`recent`] | one allocation for what many nodes or tasks have in common |
 //! | [`node_health`] | when a node counts as lost |
 //! | [`report`] | typed reasons, with the words people read |
 #![deny(missing_docs)]
@@ -21,6 +22,7 @@
 pub mod cluster;
 pub mod ledger;
 pub mod node_health;
+pub mod recent;
 pub mod report;
 pub mod schedule;
 pub mod space;
