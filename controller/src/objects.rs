@@ -69,7 +69,7 @@ pub fn replace<T: Serialize>(stored: &Stored, object: &T) -> Op {
 pub async fn change<T: DeserializeOwned>(
     store: &Store,
     key: &Key,
-    mut change: impl FnMut(&Stored, T) -> Option<Vec<Op>>,
+    mut change: impl FnMut(&Arc<Stored>, T) -> Option<Vec<Op>>,
 ) -> Result<Option<Arc<Stored>>, StoreError> {
     loop {
         let Some(stored) = store.get(key) else { return Ok(None) };

@@ -10,7 +10,7 @@ use std::sync::Arc;
 
 use muster_api::id::{Epoch, TaskUid};
 use muster_api::kind::lease::DEFAULT_GROUP;
-use muster_api::kind::node::{Node, NodeKind, RuntimeStatus, Taint};
+use muster_api::kind::node::{Node, NodeKind, NodeStatus, RuntimeStatus, Taint};
 use muster_api::kind::quota::QuotaSpec;
 use muster_api::name::{FunctionName, NodeName};
 use muster_api::pose::Pose;
@@ -18,9 +18,10 @@ use muster_api::quantity::{Bytes, MilliCpu};
 use muster_api::selector::Labels;
 
 use crate::ledger::{Denied, NodeLedger, Reservation};
+use crate::recent::Recent;
 use crate::space::{Slot, Space};
 
-/// What filters need to know of a node.
+/// What filters need to know of a node. What is mostly the same in a fleet is shared.
 #[derive(Debug, Clone, PartialEq)]
 pub struct NodeFacts {
     /// Robot or cloud.
@@ -36,13 +37,13 @@ pub struct NodeFacts {
     /// `None`: ready; otherwise what the Ready condition says.
     pub not_ready: Option<String>,
     /// SR.
-    pub sensors: BTreeSet<FunctionName>,
+    pub sensors: Arc<BTreeSet<FunctionName>>,
     /// AR.
-    pub actuators: BTreeSet<FunctionName>,
+    pub actuators: Arc<BTreeSet<FunctionName>>,
     /// Where it is.
     pub pose: Option<Pose>,
     /// How tasks can be run.
-    pub runtimes: Vec<RuntimeStatus>,
+    pub runtimes: Arc<Vec<RuntimeStatus>>,
 }
 
 impl NodeFacts {
@@ -75,9 +76,17 @@ impl NodeFacts {
     }
 }
 
-impl From<&Node> for NodeFacts {
-    fn from(node: &Node) -> Self {
-        let status = node.status.clone().unwrap_or_default();
+/// What robots of one model have in common.
+#[derive(Debug, Clone, Default)]
+struct Models {
+    functions: Recent<BTreeSet<FunctionName>>,
+    runtimes: Recent<Vec<RuntimeStatus>>,
+}
+
+impl Models {
+    fn facts(&mut self, node: &Node) -> NodeFacts {
+        let nothing = NodeStatus::default();
+        let status = node.status.as_ref().unwrap_or(&nothing);
         let not_ready = (!status.is_ready()).then(|| {
             let said = status.condition(muster_api::condition::READY);
             said.map_or_else(|| "its agent has not joined".to_owned(), |c| c.message.clone())
@@ -89,10 +98,10 @@ impl From<&Node> for NodeFacts {
             taints: node.spec.taints.clone(),
             speed: node.spec.speed,
             not_ready,
-            sensors: status.sensors.into_iter().collect(),
-            actuators: status.actuators.into_iter().collect(),
-            pose: status.pose,
-            runtimes: status.runtimes,
+            sensors: self.functions.share(status.sensors.iter().cloned().collect()),
+            actuators: self.functions.share(status.actuators.iter().cloned().collect()),
+            pose: status.pose.clone(),
+            runtimes: self.runtimes.share(status.runtimes.clone()),
         }
     }
 }
@@ -127,6 +136,7 @@ pub struct Cluster {
     quotas: BTreeMap<Arc<str>, QuotaSpec>,
     changed: BTreeSet<Slot>,
     moved: BTreeSet<Slot>,
+    models: Models,
 }
 
 impl Cluster {
@@ -156,7 +166,7 @@ impl Cluster {
     /// Takes in the present state of a Node object.
     pub fn upsert_node(&mut self, name: &NodeName, node: &Node) {
         let slot = self.slot(name);
-        let facts = NodeFacts::from(node);
+        let facts = self.models.facts(node);
         let allocatable = node.status.as_ref().map(|s| s.allocatable.clone()).unwrap_or_default();
         self.index_pose(slot, facts.kind, facts.pose.as_ref());
         let member = &mut self.members[slot as usize];

@@ -16,6 +16,7 @@
 //! | [`schedule`] | where a task goes, or why it goes nowhere (invariant 6) |
 //! | [`offer`] | which frameworks are shown what, and whose Accept passes |
 //! | [`fairness`] | namespaces' shares and quotas |
+//! | [`recent`] | one allocation for what many nodes or tasks have in common |
 //! | [`node_health`] | when a node counts as lost |
 //! | [`report`] | typed reasons, with the words people read |
 #![deny(missing_docs)]
@@ -27,6 +28,7 @@ mod fixtures;
 pub mod ledger;
 pub mod node_health;
 pub mod offer;
+pub mod recent;
 pub mod report;
 pub mod schedule;
 pub mod space;

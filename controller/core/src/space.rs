@@ -4,7 +4,8 @@
 //! of cells outwards from the position and stops as soon as no farther ring can hold anything nearer.
 //! Cells are columns: height counts in distances (robots on several floors), not in the grid.
 
-use std::collections::HashMap;
+use std::cmp::Ordering;
+use std::collections::{BinaryHeap, HashMap};
 
 use nalgebra::Point3;
 
@@ -34,13 +35,34 @@ pub struct Space {
 }
 
 /// A robot that a query found.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy)]
 pub struct Found {
     /// The robot.
     pub slot: Slot,
     /// Metres from the query's position.
     pub distance: f64,
 }
+
+/// The greatest of all is the nearest, as a [`BinaryHeap`] gives the greatest first.
+impl Ord for Found {
+    fn cmp(&self, other: &Self) -> Ordering {
+        other.distance.total_cmp(&self.distance).then(other.slot.cmp(&self.slot))
+    }
+}
+
+impl PartialOrd for Found {
+    fn partial_cmp(&self, other: &Self) -> Option<Ordering> {
+        Some(self.cmp(other))
+    }
+}
+
+impl PartialEq for Found {
+    fn eq(&self, other: &Self) -> bool {
+        self.cmp(other).is_eq()
+    }
+}
+
+impl Eq for Found {}
 
 fn cell_of(position: &Point3<f64>) -> Cell {
     // Saturating: a position beyond 2^31 cells lands in the last one, and is still compared by its
@@ -90,7 +112,14 @@ impl Space {
     /// only as far as it is taken.
     #[must_use]
     pub fn nearest(&self, map: &str, at: Point3<f64>, radius: f64) -> Nearest<'_> {
-        Nearest { grid: self.grids.get(map), at, radius, ring: 0, ready: Vec::new(), done: false }
+        Nearest {
+            grid: self.grids.get(map),
+            at,
+            radius,
+            ring: 0,
+            ready: BinaryHeap::new(),
+            done: false,
+        }
     }
 }
 
@@ -102,8 +131,8 @@ pub struct Nearest<'a> {
     radius: f64,
     /// The next ring of cells to look into.
     ring: i64,
-    /// Found and not yet given, farthest first, so that the nearest is popped.
-    ready: Vec<Found>,
+    /// Found and not yet given. A heap: a dense ring holds hundreds, of which mostly one is taken.
+    ready: BinaryHeap<Found>,
     done: bool,
 }
 
@@ -164,8 +193,6 @@ impl Nearest<'_> {
         } else if self.ready.is_empty() {
             self.skip_to_bounds((x0, x1), (y0, y1), (cx, cy));
         }
-        self.ready
-            .sort_unstable_by(|a, b| b.distance.total_cmp(&a.distance).then(b.slot.cmp(&a.slot)));
     }
 
     /// Rings that lie wholly outside the bounds hold nothing.
@@ -180,7 +207,7 @@ impl Iterator for Nearest<'_> {
 
     fn next(&mut self) -> Option<Found> {
         loop {
-            match self.ready.last() {
+            match self.ready.peek() {
                 // Strictly less: an equal distance with a smaller slot may still come from the next ring.
                 Some(found) if self.done || found.distance < self.certain() => {
                     return self.ready.pop();

@@ -5,6 +5,7 @@
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
 
 use futures::future::join_all;
 use muster_api::kind::lease::LeaseHolder;
@@ -17,6 +18,13 @@ use tokio::sync::Notify;
 use super::RETRY;
 use crate::context::Context;
 use crate::objects;
+use crate::store::Op;
+
+/// Pages in one round. Binds and reports share the disk with them, and come first.
+const ROUND: usize = 128;
+/// Between two rounds. Who looks at a node does not see the difference; a task that is bound and ends at once,
+/// and the first look at a fleet of thousands, cost the disk a fraction.
+const PAUSE: Duration = Duration::from_millis(50);
 
 /// The picture of one node's ledger.
 #[derive(Debug, Clone, PartialEq)]
@@ -81,26 +89,28 @@ impl Books {
     fn take(&self) -> BTreeMap<NodeName, Page> {
         std::mem::take(&mut *self.due.lock().unwrap_or_else(PoisonError::into_inner))
     }
+
+    /// Pages that are not written after all; a newer one of the same node wins.
+    fn put_back(&self, pages: Vec<(NodeName, Page)>) {
+        let mut due = self.due.lock().unwrap_or_else(PoisonError::into_inner);
+        for (node, page) in pages {
+            due.entry(node).or_insert(page);
+            self.changed.notify_one();
+        }
+    }
 }
 
-/// Writes pages as they come.
+/// Writes pages as they come: the first round at once, then one after every pause.
 pub async fn run(context: Arc<Context>, books: Arc<Books>) {
     loop {
         books.changed.notified().await;
-        let failed: Vec<_> = join_all(books.take().into_iter().map(|page| write(&context, page)))
-            .await
-            .into_iter()
-            .flatten()
-            .collect();
-        if failed.is_empty() {
-            continue;
+        let mut pages = books.take().into_iter().peekable();
+        while pages.peek().is_some() {
+            let round = pages.by_ref().take(ROUND).map(|page| write(&context, page));
+            let failed: Vec<_> = join_all(round).await.into_iter().flatten().collect();
+            tokio::time::sleep(if failed.is_empty() { PAUSE } else { RETRY }).await;
+            books.put_back(failed);
         }
-        tokio::time::sleep(RETRY).await;
-        for (node, page) in failed {
-            // A newer page of the node may have come meanwhile; it wins.
-            books.due.lock().unwrap_or_else(PoisonError::into_inner).entry(node).or_insert(page);
-        }
-        books.changed.notify_one();
     }
 }
 
@@ -112,7 +122,7 @@ async fn write(context: &Context, (node, page): (NodeName, Page)) -> Option<(Nod
             return None;
         }
         page.write(object.status.get_or_insert_default());
-        Some(vec![objects::replace(stored, &object)])
+        Some(vec![Op::status(stored, &object.status)])
     })
     .await;
     match written {

@@ -7,9 +7,10 @@
 //!
 //! One task owns the cluster, so decisions are made one after the other. A bind is one transaction:
 //! the task's status and the lease it needs, each with the revision it was decided on. When it fails,
-//! the reservation is released and the store's next event brings the task back.
+//! the reservation is released and the store's next event brings the task back. What this task wrote
+//! itself is known already, and is passed over when the store tells it.
 
-use std::collections::HashMap;
+use std::collections::{BTreeSet, HashMap, HashSet};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -24,6 +25,7 @@ use muster_api::phase::TaskPhase;
 use muster_api::pose::Pose;
 use muster_controller_core::cluster::Cluster;
 use muster_controller_core::ledger::Reservation;
+use muster_controller_core::recent::Recent;
 use muster_controller_core::schedule::{self, Bind, Demand, Wait};
 use tokio::sync::{mpsc, oneshot};
 use tokio::time::Instant;
@@ -105,7 +107,7 @@ struct Waiting {
     demand: Demand,
     stored: Arc<Stored>,
     /// What its status says.
-    written: Vec<NodeRefusal>,
+    written: Arc<[NodeRefusal]>,
     written_at: Instant,
 }
 
@@ -117,8 +119,11 @@ pub struct Scheduler {
     questions: mpsc::Receiver<Question>,
     cluster: Cluster,
     waiting: HashMap<TaskUid, Waiting>,
+    specs: Recent<TaskSpec>,
+    /// Revisions that this task wrote and the watcher has not brought yet.
+    own: HashSet<u64>,
     /// Nodes whose books changed since the last pass.
-    dirty: std::collections::BTreeSet<NodeName>,
+    dirty: BTreeSet<NodeName>,
 }
 
 impl Scheduler {
@@ -133,7 +138,9 @@ impl Scheduler {
             questions,
             cluster: Cluster::new(),
             waiting: HashMap::new(),
-            dirty: std::collections::BTreeSet::new(),
+            specs: Recent::default(),
+            own: HashSet::new(),
+            dirty: BTreeSet::new(),
         };
         (scheduler, Handle { questions: sender })
     }
@@ -161,6 +168,7 @@ impl Scheduler {
         let watcher = watch_from_now(&self.context.store).await;
         self.cluster = Cluster::new();
         self.waiting.clear();
+        self.own.clear();
         for resource in [NODES, LEASES, TASKS] {
             for stored in self.context.store.list(resource, None).items {
                 self.take_in(resource, Change::Put, &stored);
@@ -177,7 +185,9 @@ impl Scheduler {
     fn take_in_all(&mut self, watcher: &mut Watcher, mut events: Vec<Event>) {
         loop {
             for event in &events {
-                self.take_in(event.object.key.resource, event.change, &event.object);
+                if !self.own.remove(&event.revision()) {
+                    self.take_in(event.object.key.resource, event.change, &event.object);
+                }
             }
             // One pass serves everything that is there already.
             match watcher.take() {
@@ -236,13 +246,18 @@ impl Scheduler {
                 let demand = Demand {
                     uid: uid.clone(),
                     title: title.into(),
-                    spec: Arc::new(task.spec),
+                    spec: self.specs.share(task.spec),
                     since,
                 };
                 let written_at = Instant::now();
                 self.waiting.insert(
                     uid,
-                    Waiting { demand, stored: Arc::clone(stored), written: status.why, written_at },
+                    Waiting {
+                        demand,
+                        stored: Arc::clone(stored),
+                        written: status.why.into(),
+                        written_at,
+                    },
                 );
             }
             (phase, Some(node)) if phase.holds_node() => {
@@ -310,7 +325,8 @@ impl Scheduler {
         let mut retry = None;
         for (bind, result) in binds.into_iter().zip(results) {
             match result {
-                Some(Ok(_)) => {
+                Some(Ok(written)) => {
+                    self.own.extend(written.iter().map(|stored| stored.revision));
                     tracing::info!(task = %bind.uid, node = %bind.node, score = bind.score, "bound");
                     metrics::counter!("muster_binds_total").increment(1);
                     self.waiting.remove(&bind.uid);
@@ -336,7 +352,8 @@ impl Scheduler {
     }
 
     /// Carries binds out, each as a transaction of its own; the results are in the same order. None: the
-    /// task does not wait any more. While one chunk is on its way to the disk the next is rendered.
+    /// task does not wait any more. The chunks are rendered beside each other, and while one is on its way to
+    /// the disk.
     async fn commit(&self, binds: &[Bind]) -> Vec<Option<Committed>> {
         let mut chunks = Vec::with_capacity(binds.len().div_ceil(CHUNK));
         for chunk in binds.chunks(CHUNK) {
@@ -381,10 +398,8 @@ impl Scheduler {
             }),
             ..TaskStatus::default()
         };
-        let mut value = waiting.stored.value();
-        value["status"] = objects::to_value(&status);
-        let key = waiting.stored.key.clone();
-        ops.push(Op::replace(key.clone(), value, waiting.stored.revision));
+        ops.push(Op::status(&waiting.stored, &status));
+        let key = &waiting.stored.key;
         for (group, epoch) in &bind.leases {
             let holder = LeaseHolder {
                 namespace: key.namespace().unwrap_or_default().to_owned(),
@@ -425,35 +440,50 @@ impl Scheduler {
         let mut later = None;
         let mut due = Vec::new();
         for Wait { uid, why } in waits {
-            let Some(waiting) = self.waiting.get(&uid).filter(|w| w.written != why) else {
+            let Some(waiting) = self.waiting.get_mut(&uid) else { continue };
+            if waiting.written == why {
+                // One list in memory for all that say the same.
+                waiting.written = why;
                 continue;
-            };
+            }
             let at = waiting.written_at + WHY_EVERY;
             if (same_reasons(&waiting.written, &why) && at > now) || due.len() == WHY_AT_ONCE {
                 let at = at.max(now + WHY_EVERY / 10);
                 later = Some(later.map_or(at, |l: Instant| l.min(at)));
                 continue;
             }
-            due.push((waiting.stored.key.clone(), uid, why));
+            due.push((Arc::clone(&waiting.stored), uid, why));
         }
         let store = &self.context.store;
-        join_all(due.into_iter().map(|(key, uid, why)| async move {
-            let written = objects::change(store, &key, |stored, mut task: Task| {
-                let status = task.status.get_or_insert_default();
-                if *stored.uid != *uid.as_str() || status.phase != TaskPhase::Pending || status.why == why {
-                    return None;
-                }
-                status.reason = "Unschedulable".to_owned();
-                status.message = headline(&why);
-                status.why.clone_from(&why);
-                Some(vec![objects::replace(stored, &task)])
-            });
-            if let Err(error) = written.await {
-                tracing::warn!(task = %key, error = crate::app::chain(&error), "a task's reasons are not written");
-            }
+        let written = join_all(due.into_iter().map(|(stored, uid, why)| async move {
+            // As in a bind: a task that waits has nothing else in its status.
+            let status = TaskStatus {
+                reason: "Unschedulable".to_owned(),
+                message: headline(&why),
+                why: why.to_vec(),
+                ..TaskStatus::default()
+            };
+            (store.apply_one(Op::status(&stored, &status)).await, uid, why)
         }))
         .await;
+        for (result, uid, why) in written {
+            match result {
+                Ok(stored) => self.reasons_written(&uid, stored, why),
+                // What changed arrives as an event and brings the task back, if it still waits.
+                Err(error) if objects::is_race(&error) => {}
+                Err(error) => {
+                    tracing::warn!(task = %uid, error = crate::app::chain(&error), "a task's reasons are not written");
+                }
+            }
+        }
         later
+    }
+
+    fn reasons_written(&mut self, uid: &TaskUid, stored: Arc<Stored>, why: Arc<[NodeRefusal]>) {
+        self.own.insert(stored.revision);
+        if let Some(waiting) = self.waiting.get_mut(uid) {
+            (waiting.stored, waiting.written, waiting.written_at) = (stored, why, Instant::now());
+        }
     }
 }
 

@@ -184,6 +184,6 @@ fn describe(names: &[(TaskUid, Value)], plan: &Plan, changes: Vec<Value>, revisi
         })
         .collect();
     let waits: Vec<Value> =
-        plan.waits.iter().map(|wait| with_name(&wait.uid, json!({ "why": wait.why }))).collect();
+        plan.waits.iter().map(|wait| with_name(&wait.uid, json!({ "why": &*wait.why }))).collect();
     json!({ "changes": changes, "placements": placements, "waits": waits, "revision": revision.to_string() })
 }

@@ -83,7 +83,14 @@ async fn preconditions(store: &Store) {
     let both = Precondition::Match { revision: Some(a.revision), uid: Some("uid-a".into()) };
     let next = store.put(task("a"), body("a", 1), both).await.unwrap();
     assert_eq!(next.revision, a.revision + 1);
-    let gone = store.delete(task("a"), Precondition::revision(next.revision)).await.unwrap();
+    let said = store.apply_one(Op::status(&next, &json!({"phase": "Bound"}))).await.unwrap();
+    let mut expected = body("a", 1);
+    expected["metadata"]["resourceVersion"] = said.revision.to_string().into();
+    expected["status"] = json!({"phase": "Bound"});
+    assert_eq!(said.value(), expected, "a status replaces nothing else");
+    let late = store.apply_one(Op::status(&next, &json!({"phase": "Running"}))).await;
+    assert!(matches!(late, Err(StoreError::Conflict { .. })), "{late:?}");
+    let gone = store.delete(task("a"), Precondition::revision(said.revision)).await.unwrap();
     assert_eq!(gone.value()["metadata"]["resourceVersion"], gone.revision.to_string());
     assert_eq!(store.get(&task("a")), None);
 }

@@ -199,6 +199,11 @@ fn prepare(op: Op) -> Result<Prepared, StoreError> {
             Ok(template) => Ok(Prepared::Put { key, template, precondition }),
             Err(reason) => Err(StoreError::Malformed { key, reason }),
         },
+        Op::Status { of, status } => Ok(Prepared::Put {
+            key: of.key.clone(),
+            template: Template::with_status(&of, &status),
+            precondition: Precondition::revision(of.revision),
+        }),
         Op::Delete { key, precondition } => Ok(Prepared::Delete { key, precondition }),
         Op::Check { key, precondition } => Ok(Prepared::Check { key, precondition }),
     }

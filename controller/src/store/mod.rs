@@ -41,8 +41,10 @@ mod writer;
 use std::sync::Arc;
 
 use bytes::Bytes;
+use serde::Serialize;
 use serde::de::DeserializeOwned;
 use serde_json::Value;
+use serde_json::value::RawValue;
 
 pub use backend::BackendError;
 pub use error::{OpenError, StoreError, UpdateError};
@@ -145,6 +147,13 @@ pub enum Op {
         /// What must hold.
         precondition: Precondition,
     },
+    /// Replace the `status` of an object, and nothing else of it, while it is at the revision of `of`.
+    Status {
+        /// The object as it was read.
+        of: Arc<Stored>,
+        /// Its new status.
+        status: Box<RawValue>,
+    },
     /// Change nothing, but let the transaction pass only while this holds of another object.
     Check {
         /// The object that the transaction relies on.
@@ -172,6 +181,16 @@ impl Op {
     #[must_use]
     pub fn replace(key: Key, value: Value, revision: u64) -> Self {
         Self::Put { key, value, precondition: Precondition::revision(revision) }
+    }
+
+    /// A new status for an object, that fails unless the object is still what was read.
+    ///
+    /// # Panics
+    /// When `status` does not serialize, which the types of resources do.
+    #[must_use]
+    pub fn status<T: Serialize>(of: &Arc<Stored>, status: &T) -> Self {
+        let status = serde_json::value::to_raw_value(status).expect("a status serializes to JSON");
+        Self::Status { of: Arc::clone(of), status }
     }
 
     /// A removal that fails unless the object is still at `revision`.

@@ -104,15 +104,19 @@ impl Sqlite {
     }
 
     async fn write(&mut self, batch: Batch<'_>) -> Result<(), BackendError> {
-        let mut transaction = self.connection().await?.begin_with("BEGIN IMMEDIATE").await?;
+        let connection = self.connection().await?;
+        let Some(Compaction { through, garbage }) = batch.compaction else {
+            // One statement is a transaction by itself, and two hops to SQLite's thread are saved.
+            sqlx::query(INSERT).bind(rows(batch.events)).execute(connection).await?;
+            return Ok(());
+        };
+        let mut transaction = connection.begin_with("BEGIN IMMEDIATE").await?;
         if !batch.events.is_empty() {
             sqlx::query(INSERT).bind(rows(batch.events)).execute(&mut *transaction).await?;
         }
-        if let Some(Compaction { through, garbage }) = batch.compaction {
-            sqlx::query(COMPACT_META).bind(signed(*through)?).execute(&mut *transaction).await?;
-            let garbage = serde_json::to_string(garbage).expect("numbers serialize");
-            sqlx::query(COMPACT_ROWS).bind(garbage).execute(&mut *transaction).await?;
-        }
+        sqlx::query(COMPACT_META).bind(signed(*through)?).execute(&mut *transaction).await?;
+        let garbage = serde_json::to_string(garbage).expect("numbers serialize");
+        sqlx::query(COMPACT_ROWS).bind(garbage).execute(&mut *transaction).await?;
         transaction.commit().await?;
         Ok(())
     }

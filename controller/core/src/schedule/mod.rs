@@ -65,8 +65,8 @@ pub struct Bind {
 pub struct Wait {
     /// The task.
     pub uid: TaskUid,
-    /// Why, per node.
-    pub why: Vec<NodeRefusal>,
+    /// Why, per node; one list for all that ask the same.
+    pub why: Arc<[NodeRefusal]>,
 }
 
 /// What is to be done.
@@ -87,16 +87,16 @@ pub fn schedule(cluster: &mut Cluster, demands: &mut [Demand]) -> Plan {
     demands.sort_by_key(|d| (std::cmp::Reverse(d.spec.priority), d.since));
     let mut plan = Plan::default();
     // A pass only takes, so what had no place for a task has none for one that asks the same.
-    let mut hopeless: Vec<(Arc<TaskSpec>, Vec<NodeRefusal>)> = Vec::new();
+    let mut hopeless: Vec<(Arc<TaskSpec>, Arc<[NodeRefusal]>)> = Vec::new();
     let mut accounts = cluster.has_quotas().then(|| Accounts::of(cluster));
     for demand in demands.iter() {
         if let Some(over) = accounts.as_ref().and_then(|a| over_quota(cluster, a, demand)) {
-            plan.waits.push(Wait { uid: demand.uid.clone(), why: vec![quota_refusal(&over)] });
+            plan.waits.push(Wait { uid: demand.uid.clone(), why: [quota_refusal(&over)].into() });
             continue;
         }
         let known = hopeless.iter().find(|(spec, _)| asks_the_same(spec, &demand.spec));
         if let Some((_, why)) = known {
-            plan.waits.push(Wait { uid: demand.uid.clone(), why: why.clone() });
+            plan.waits.push(Wait { uid: demand.uid.clone(), why: Arc::clone(why) });
             continue;
         }
         match choose(cluster, demand) {
@@ -110,11 +110,11 @@ pub fn schedule(cluster: &mut Cluster, demands: &mut [Demand]) -> Plan {
                 plan.binds.push(bind);
             }
             None => {
-                let why = summarise(explain(cluster, demand));
+                let why: Arc<[NodeRefusal]> = summarise(explain(cluster, demand)).into();
                 if hopeless.len() == HOPELESS_KEPT {
                     hopeless.remove(0);
                 }
-                hopeless.push((Arc::clone(&demand.spec), why.clone()));
+                hopeless.push((Arc::clone(&demand.spec), Arc::clone(&why)));
                 plan.waits.push(Wait { uid: demand.uid.clone(), why });
             }
         }

@@ -32,7 +32,11 @@ fn bound(plan: &Plan) -> Vec<(&str, &str)> {
 }
 
 fn reasons(plan: &Plan) -> Vec<(&str, &str)> {
-    plan.waits.iter().flat_map(|w| &w.why).map(|w| (w.node.as_str(), w.reason.as_str())).collect()
+    plan.waits
+        .iter()
+        .flat_map(|w| w.why.iter())
+        .map(|w| (w.node.as_str(), w.reason.as_str()))
+        .collect()
 }
 
 use NodeKind::{Cloud, Robot};
