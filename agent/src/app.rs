@@ -183,6 +183,10 @@ pub async fn serve(
     // Only now: a join that failed must not tie the directory to a name.
     identity.write(&config.data_dir)?;
 
+    config.declared.keep(&config.data_dir)?;
+    if !config.remembered.is_empty() {
+        tracing::info!(flags = config.remembered.join(" "), "not given now; kept as given last");
+    }
     let enforcer = enforcer(&identity.id).await;
     let enforced = match &enforcer {
         Ok(kernel) => Ok(Enforced {

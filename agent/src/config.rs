@@ -1,7 +1,9 @@
-//! What the agent is told: flags and `agent.yaml`, the same fields; a flag wins.
+//! What the agent is told: flags and `agent.yaml`, the same fields; a flag wins. What neither says
+//! of the node is as it was declared last (see `declared`).
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
+use std::str::FromStr;
 
 use clap::ValueEnum;
 use muster_api::kind::node::NodeKind;
@@ -11,6 +13,7 @@ use muster_api::quantity::{Bytes, MilliCpu};
 use muster_api::resource::parse_function_list;
 use serde::Deserialize;
 
+use crate::declared::Declared;
 use crate::durable::{self, FileError, Keep};
 use crate::position::PositionSource;
 use crate::runtime::process::attempt::LogBounds;
@@ -37,7 +40,8 @@ impl From<Kind> for NodeKind {
     }
 }
 
-/// Flags of `muster-agent` and of `muster agent`.
+/// Flags of `muster-agent` and of `muster agent`. What a node declares of itself (labels, sensors,
+/// actuators, map, position, cpu, memory, speed) is remembered in its data directory.
 #[derive(Debug, Clone, Default, clap::Args)]
 pub struct Args {
     /// The controller, https://HOST:PORT; an agent that joined before knows it
@@ -58,28 +62,28 @@ pub struct Args {
     /// Where the agent keeps its identity and its tasks
     #[arg(long, value_name = "DIR")]
     pub data_dir: Option<PathBuf>,
-    /// A label of the node, may be repeated
+    /// A label of the node, may be repeated; without any, the labels given last stay
     #[arg(long = "label", value_name = "KEY=VALUE")]
     pub labels: Vec<String>,
-    /// Sensor functions, kinect:ImageGen;kinect:LaserGen
+    /// Sensor functions, kinect:ImageGen;kinect:LaserGen [default: as given last]
     #[arg(long, value_name = "LIST")]
     pub sr_res: Option<String>,
-    /// Actuator functions, base:Drive
+    /// Actuator functions, base:Drive [default: as given last]
     #[arg(long, value_name = "LIST")]
     pub ar_res: Option<String>,
-    /// The map that positions are in [default: map]
+    /// The map that positions are in [default: as given last, else map]
     #[arg(long, value_name = "NAME")]
     pub map: Option<String>,
-    /// Where the robot is, static:X,Y or static:X,Y,YAW
+    /// Where the robot is, static:X,Y or static:X,Y,YAW [default: as given last]
     #[arg(long, value_name = "SOURCE", allow_hyphen_values = true)]
     pub position: Option<String>,
-    /// Offer at most this much cpu
+    /// Offer at most this much cpu [default: as given last, else all]
     #[arg(long, value_name = "CPU")]
     pub cpu: Option<String>,
-    /// Offer at most this much memory
+    /// Offer at most this much memory [default: as given last, else all]
     #[arg(long, value_name = "BYTES")]
     pub memory: Option<String>,
-    /// Usual speed of the robot, m/s
+    /// Usual speed of the robot, m/s [default: as given last]
     #[arg(long, value_name = "M/S")]
     pub speed: Option<f64>,
     /// Run tasks with quotas even where the kernel cannot hold them to their quotas
@@ -105,7 +109,7 @@ struct FileConfig {
     name: Option<String>,
     kind: Option<Kind>,
     data_dir: Option<PathBuf>,
-    labels: BTreeMap<String, String>,
+    labels: Option<BTreeMap<String, String>>,
     sr_res: Option<String>,
     ar_res: Option<String>,
     map: Option<String>,
@@ -139,6 +143,10 @@ pub struct Config {
     pub(crate) log: LogBounds,
     /// Absent: no Docker.
     pub(crate) docker_socket: Option<PathBuf>,
+    /// To be kept for the next start.
+    pub(crate) declared: Declared,
+    /// The flags that nobody gave now, and that count as they were given last.
+    pub(crate) remembered: Vec<&'static str>,
 }
 
 /// Why the settings make no sense.
@@ -169,6 +177,9 @@ pub enum ConfigError {
         /// What is wrong, and what would be right.
         reason: String,
     },
+    /// What was declared last cannot be read.
+    #[error("what this node declared last cannot be read")]
+    Declared(#[from] FileError),
 }
 
 fn field(field: &'static str) -> impl Fn(&dyn std::error::Error) -> ConfigError {
@@ -186,23 +197,24 @@ impl Args {
             Some(path) => read(path)?,
             None => FileConfig::default(),
         };
-        let mut labels = file.labels;
-        for label in &self.labels {
-            let (key, value) = label.split_once('=').ok_or_else(|| ConfigError::Field {
-                field: "--label",
-                reason: format!("{label:?} is not KEY=VALUE"),
-            })?;
-            labels.insert(key.to_owned(), value.to_owned());
-        }
-        let functions = |name, text: Option<String>| {
-            parse_function_list(&text.unwrap_or_default()).map_err(|e| field(name)(&e))
+        let data_dir = absolute(self.data_dir.or(file.data_dir).unwrap_or_else(default_data_dir));
+        let mut declared = Declared {
+            labels: labels(file.labels, &self.labels)?,
+            sr_res: self.sr_res.or(file.sr_res),
+            ar_res: self.ar_res.or(file.ar_res),
+            map: self.map.or(file.map),
+            position: self.position.or(file.position),
+            cpu: self.cpu.or(file.cpu),
+            memory: self.memory.or(file.memory),
+            speed: self.speed.or(file.speed),
+        };
+        let remembered = declared.remember(Declared::last(&data_dir)?);
+        let functions = |name, text: &Option<String>| {
+            parse_function_list(text.as_deref().unwrap_or_default()).map_err(|e| field(name)(&e))
         };
         let kind = self.kind.or(file.kind);
-        let position = self.position.or(file.position);
-        let position =
-            position.map(|text| text.parse().map_err(|e| field("--position")(&e))).transpose()?;
-        let actuators = functions("--ar-res", self.ar_res.or(file.ar_res))?;
-        let sensors = functions("--sr-res", self.sr_res.or(file.sr_res))?;
+        let actuators = functions("--ar-res", &declared.ar_res)?;
+        let sensors = functions("--sr-res", &declared.sr_res)?;
         if kind == Some(Kind::Cloud) && !(actuators.is_empty() && sensors.is_empty()) {
             return Err(ConfigError::Field {
                 field: "--kind",
@@ -210,25 +222,21 @@ impl Args {
             });
         }
         let name = self.name.or(file.name);
-        let cpu = self.cpu.or(file.cpu);
-        let memory = self.memory.or(file.memory);
         let socket = self.docker_socket.or(file.docker_socket);
         Ok(Config {
             join: self.join.or(file.join),
             token: self.token.or(file.token),
             name: name.map(NodeName::new).transpose().map_err(|e| field("--name")(&e))?,
             kind,
-            data_dir: absolute(self.data_dir.or(file.data_dir).unwrap_or_else(default_data_dir)),
-            labels,
+            data_dir,
+            labels: declared.labels.clone().unwrap_or_default(),
             sensors,
             actuators,
-            position,
-            map: self.map.or(file.map).unwrap_or_else(|| DEFAULT_MAP.to_owned()),
-            cpu: cpu.map(|text| text.parse().map_err(|e| field("--cpu")(&e))).transpose()?,
-            memory: memory
-                .map(|text| text.parse().map_err(|e| field("--memory")(&e)))
-                .transpose()?,
-            speed: speed(self.speed.or(file.speed))?,
+            position: parsed("--position", &declared.position)?,
+            map: declared.map.clone().unwrap_or_else(|| DEFAULT_MAP.to_owned()),
+            cpu: parsed("--cpu", &declared.cpu)?,
+            memory: parsed("--memory", &declared.memory)?,
+            speed: speed(declared.speed)?,
             unenforced_quotas: self.unenforced_quotas || file.unenforced_quotas,
             log: log_bounds(
                 self.log_max_size.or(file.log_max_size),
@@ -239,14 +247,41 @@ impl Args {
                 Some(path) => Some(PathBuf::from(path)),
                 None => Some(PathBuf::from(DOCKER_SOCKET)),
             },
+            declared,
+            remembered,
         })
     }
 }
 
+/// The file's labels and the flags' together; `None` when neither says anything of labels.
+fn labels(
+    file: Option<BTreeMap<String, String>>,
+    flags: &[String],
+) -> Result<Option<BTreeMap<String, String>>, ConfigError> {
+    if file.is_none() && flags.is_empty() {
+        return Ok(None);
+    }
+    let mut labels = file.unwrap_or_default();
+    for label in flags {
+        let (key, value) = label.split_once('=').ok_or_else(|| ConfigError::Field {
+            field: "--label",
+            reason: format!("{label:?} is not KEY=VALUE"),
+        })?;
+        labels.insert(key.to_owned(), value.to_owned());
+    }
+    Ok(Some(labels))
+}
+
+fn parsed<T>(flag: &'static str, text: &Option<String>) -> Result<Option<T>, ConfigError>
+where
+    T: FromStr<Err: std::error::Error + 'static>,
+{
+    text.as_deref().map(|text| text.parse().map_err(|e| field(flag)(&e))).transpose()
+}
+
 fn log_bounds(size: Option<String>, files: Option<u32>) -> Result<LogBounds, ConfigError> {
     let default = LogBounds::default();
-    let bytes: Option<Bytes> =
-        size.map(|text| text.parse().map_err(|e| field("--log-max-size")(&e))).transpose()?;
+    let bytes: Option<Bytes> = parsed("--log-max-size", &size)?;
     Ok(LogBounds {
         bytes: bytes.map_or(default.bytes, |bytes| bytes.0),
         files: files.unwrap_or(default.files).max(1),
@@ -334,6 +369,11 @@ mod tests {
         (dir, path)
     }
 
+    /// Of a directory in which nothing was declared before.
+    fn args() -> Args {
+        Args { data_dir: Some(PathBuf::from("/no/such/directory")), ..Args::default() }
+    }
+
     #[test]
     fn flags_win_over_the_file() {
         let (_dir, path) = file("name: a\nkind: robot\nsrRes: kinect:ImageGen\nlabels: {x: '1'}\n");
@@ -342,7 +382,7 @@ mod tests {
             name: Some("b".to_owned()),
             labels: vec!["y=2".to_owned()],
             docker_socket: Some("none".to_owned()),
-            ..Args::default()
+            ..args()
         };
         let config = args.resolve().unwrap();
         assert_eq!(config.name.unwrap().as_str(), "b");
@@ -355,7 +395,7 @@ mod tests {
     #[test]
     fn mistakes_in_the_file_have_a_place() {
         let (_dir, path) = file("name: a\nposition: static:1,2\nspede: 3\n");
-        let error = Args { config: Some(path), ..Args::default() }.resolve().unwrap_err();
+        let error = Args { config: Some(path), ..args() }.resolve().unwrap_err();
         let text = error.to_string();
         assert!(text.contains("spede") && text.contains('3'), "{text}");
     }
@@ -363,15 +403,12 @@ mod tests {
     #[test]
     fn mistakes_in_flags_name_the_flag() {
         let bad = [
-            (Args { position: Some("static:1".into()), ..Args::default() }, "--position"),
-            (Args { cpu: Some("many".into()), ..Args::default() }, "--cpu"),
-            (Args { ar_res: Some("base".into()), ..Args::default() }, "--ar-res"),
-            (Args { labels: vec!["x".into()], ..Args::default() }, "--label"),
-            (Args { speed: Some(-1.0), ..Args::default() }, "--speed"),
-            (
-                Args { kind: Some(Kind::Cloud), ar_res: Some("b:D".into()), ..Args::default() },
-                "--kind",
-            ),
+            (Args { position: Some("static:1".into()), ..args() }, "--position"),
+            (Args { cpu: Some("many".into()), ..args() }, "--cpu"),
+            (Args { ar_res: Some("base".into()), ..args() }, "--ar-res"),
+            (Args { labels: vec!["x".into()], ..args() }, "--label"),
+            (Args { speed: Some(-1.0), ..args() }, "--speed"),
+            (Args { kind: Some(Kind::Cloud), ar_res: Some("b:D".into()), ..args() }, "--kind"),
         ];
         for (args, flag) in bad {
             let error = args.resolve().unwrap_err().to_string();

@@ -75,6 +75,8 @@ pub(crate) struct Driver {
 pub(crate) enum Begin {
     /// A task that was just assigned.
     New(TaskUid, Box<Assignment>, Desired),
+    /// A task whose assignment cannot be read, and why.
+    Unreadable(TaskUid, Box<Assignment>, String),
     /// A task of an earlier life of the agent.
     Restored(Box<Record>),
 }
@@ -87,8 +89,13 @@ pub(crate) async fn drive(
     let context = context(&shared);
     let (record, response) = match begin {
         Begin::New(uid, assignment, desired) => {
-            let prepare = Kind::of(&assignment.spec) == Kind::Docker;
-            let (workload, response) = Workload::assigned(uid, desired, prepare, context);
+            let fetch = spec::fetch(&assignment.spec);
+            let (workload, response) = Workload::assigned(uid, desired, fetch, context);
+            let boot_id = shared.boot_id.clone();
+            (Record { boot_id, assignment: *assignment, workload }, response)
+        }
+        Begin::Unreadable(uid, assignment, why) => {
+            let (workload, response) = Workload::unreadable(uid, why, context);
             let boot_id = shared.boot_id.clone();
             (Record { boot_id, assignment: *assignment, workload }, response)
         }
@@ -210,6 +217,7 @@ impl Driver {
                     Launched::Running(started) => Outcome::Launched(started),
                     Launched::Ended(exit) => Outcome::Exited(exit),
                     Launched::Refused(failure) => Outcome::LaunchFailed(failure),
+                    Launched::Unprepared(failure) => Outcome::Unprepared(failure),
                     Launched::Unclear(error) => {
                         tracing::warn!(id = %launch.id, error = chain(&error), "launch unclear");
                         Outcome::LaunchUnclear

@@ -9,6 +9,7 @@
 //! | module | holds |
 //! |---|---|
 //! | `config` | flags and `agent.yaml` |
+//! | `declared` | what the node said of itself, for its next start |
 //! | `app` | starts, joins and ends everything |
 //! | `supervisor`, `driver` | what `muster-agent-core` decides, carried out |
 //! | `checkpoint`, `durable` | what survives the agent |
@@ -26,6 +27,7 @@ mod clock;
 pub mod config;
 mod contact;
 mod driver;
+mod declared;
 mod durable;
 mod link;
 mod node;

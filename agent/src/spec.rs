@@ -4,7 +4,10 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use muster_agent_core::desired::{Desired, RestartPolicy, StopOrder};
+use muster_agent_core::workload::Fetch;
 use muster_api::kind::task::{self, TaskSpec};
+use muster_api::wire::WireError;
+use muster_api::wire::agent_session::spec_from_wire;
 
 use crate::checkpoint::Assignment;
 use crate::runtime::launch::{AttemptId, Container, Launch, Limits, Mount, Network, Program, Pull};
@@ -27,6 +30,30 @@ impl Kind {
     pub(crate) fn of(spec: &TaskSpec) -> Kind {
         if spec.run.container.is_some() { Kind::Docker } else { Kind::Process }
     }
+}
+
+/// What its runtime may have to fetch for it.
+pub(crate) fn fetch(spec: &TaskSpec) -> Fetch {
+    match &spec.run.container {
+        None => Fetch::Nothing,
+        Some(run) if run.pull_policy == task::PullPolicy::Always => Fetch::Always,
+        Some(_) => Fetch::Missing,
+    }
+}
+
+/// A spec as an assignment carries it. One that names no runtime of this agent cannot be read.
+pub(crate) fn read(bytes: &[u8]) -> Result<TaskSpec, WireError> {
+    let spec = spec_from_wire(bytes)?;
+    if spec.run.process.is_none() && spec.run.container.is_none() {
+        let none = "run: this agent runs process and container, and neither is there";
+        return Err(WireError::invalid("assignment.spec", none));
+    }
+    Ok(spec)
+}
+
+/// What stands for a spec that cannot be read: it asks for nothing, and is never launched.
+pub(crate) fn nothing() -> TaskSpec {
+    spec_from_wire(b"{}").expect("every field of a spec has a default")
 }
 
 /// What the core needs to know.

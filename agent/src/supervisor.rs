@@ -4,11 +4,10 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use muster_agent_core::desired::StopOrder;
-use muster_agent_core::plan::{self, Assignments, Step};
+use muster_agent_core::plan::{self, Assignments, Skipped, Step};
 use muster_agent_core::workload::Event;
 use muster_api::id::TaskUid;
 use muster_api::wire::agent::v1 as proto;
-use muster_api::wire::agent_session::spec_from_wire;
 use tokio::sync::mpsc;
 use tokio::task::JoinSet;
 
@@ -63,7 +62,12 @@ impl Supervisor {
         let known = self.tasks.iter().map(|(uid, task)| (uid.clone(), task.forgotten)).collect();
         let plan = plan::plan(assignments, &known);
         for skipped in plan.skipped {
-            tracing::debug!(?skipped, "nothing to do");
+            match skipped {
+                Skipped::Unreadable(uid, why) => {
+                    tracing::warn!(%uid, why, "what the controller now wants cannot be read");
+                }
+                skipped => tracing::debug!(?skipped, "nothing to do"),
+            }
         }
         for step in plan.steps {
             match step {
@@ -71,6 +75,11 @@ impl Supervisor {
                     let Some(assignment) = details.remove(&uid) else { continue };
                     tracing::info!(%uid, task = %assignment.name, "assigned");
                     self.start(uid.clone(), false, Begin::New(uid, Box::new(assignment), desired));
+                }
+                Step::Refuse(uid, why) => {
+                    let Some(assignment) = details.remove(&uid) else { continue };
+                    tracing::error!(%uid, why, "an assignment cannot be read");
+                    self.start(uid.clone(), false, Begin::Unreadable(uid, assignment.into(), why));
                 }
                 Step::Tell(uid, Event::Assigned(desired)) => {
                     let Some(assignment) = details.remove(&uid) else { continue };
@@ -137,35 +146,35 @@ fn decode(message: proto::Assignments, known: &BTreeMap<TaskUid, Task>) -> (Assi
             tracing::error!(%uid, "an assignment's uid is refused");
             continue;
         }
-        let task_spec = match spec_from_wire(&wire.spec) {
+        if wire.ended && !known.contains_key(&uid) {
+            // Nothing of it is here, and it must not begin.
+            continue;
+        }
+        let assignment = |spec| Assignment {
+            namespace: wire.namespace.clone(),
+            name: wire.name.clone(),
+            spec,
+            lease: wire.lease.as_ref().map(lease_text),
+        };
+        let task_spec = match spec::read(&wire.spec) {
             Ok(task_spec) => task_spec,
             Err(error) => {
-                tracing::error!(%uid, %error, "an assignment cannot be read");
-                assignments.unreadable.insert(uid);
+                details.insert(uid.clone(), assignment(spec::nothing()));
+                assignments.unreadable.insert(uid, error.to_string());
                 continue;
             }
         };
-        let mut stop = wire
-            .stop
-            .map(|stop| StopOrder { grace_ms: stop.grace_period_ms.into(), reason: stop.reason });
+        let mut stop = wire.stop.as_ref().map(|stop| StopOrder {
+            grace_ms: stop.grace_period_ms.into(),
+            reason: stop.reason.clone(),
+        });
         if wire.ended {
-            if !known.contains_key(&uid) {
-                // Nothing of it is here, and it must not begin.
-                assignments.unreadable.insert(uid);
-                continue;
-            }
             let grace_ms = u64::from(task_spec.grace_period_seconds) * 1_000;
             let reason = "its end is recorded".to_owned();
             stop = stop.or(Some(StopOrder { grace_ms, reason }));
         }
         assignments.upserts.insert(uid.clone(), spec::desired(&task_spec, stop));
-        let assignment = Assignment {
-            namespace: wire.namespace,
-            name: wire.name,
-            spec: task_spec,
-            lease: wire.lease.as_ref().map(lease_text),
-        };
-        details.insert(uid, assignment);
+        details.insert(uid, assignment(task_spec));
     }
     (assignments, details)
 }
@@ -214,6 +223,34 @@ mod tests {
         let known = BTreeMap::from([(TaskUid::new("a"), Task { inbox, forgotten: false })]);
         let (assignments, _) = decode(message, &known);
         assert!(assignments.upserts[&TaskUid::new("a")].stop.is_some());
+    }
+
+    #[test]
+    fn what_cannot_be_read_is_named_with_its_field() {
+        let cases: [(&[u8], &str); 5] = [
+            (br#"{"run":{"wasm":{"module":"x"}}}"#, "wasm"),
+            (br#"{"run":{}}"#, "run"),
+            (br#"{"run":{"process":{}}}"#, "run.process: missing field `command`"),
+            (
+                br#"{"run":{"process":{"command":["true"]}},"restartPolicy":"Hourly"}"#,
+                "restartPolicy",
+            ),
+            (b"not json", "assignment.spec"),
+        ];
+        for (spec, field) in cases {
+            let wire = proto::Assignment {
+                uid: "a".to_owned(),
+                name: "t".to_owned(),
+                spec: spec.to_vec(),
+                ..proto::Assignment::default()
+            };
+            let message = proto::Assignments { upserts: vec![wire], ..Default::default() };
+            let (assignments, details) = decode(message, &BTreeMap::new());
+            let why = &assignments.unreadable[&TaskUid::new("a")];
+            assert!(why.contains(field), "{why}");
+            assert!(assignments.upserts.is_empty());
+            assert_eq!(details[&TaskUid::new("a")].name, "t");
+        }
     }
 
     #[test]

@@ -6,10 +6,10 @@ mod common;
 
 use std::process::Command;
 use std::sync::OnceLock;
-use std::time::{Duration, Instant};
 
 use common::agent::Agent;
 use common::controller::Controller;
+use common::cpu::{Accounts, Heavy};
 use common::until;
 use muster_api::wire::agent::v1 as proto;
 use serde_json::{Value, json};
@@ -130,15 +130,14 @@ fn limits_are_the_kernels() {
         json!({ "cpu": "500m", "memory": "64Mi", "pids": 20, "io": { "writeBps": "1Mi" } });
     controller.assign("d-spin", spec);
     controller.wait_running("d-spin");
-    let usage = || controller.usage("d-spin").map(|usage| usage.cpu_total_usec);
-    // The engine's own group weighs like one process of the host: on a busy host a container gets less
-    // than its quota, so only the upper bound can be relied on here.
-    let (before, begun) = (until("usage", usage), Instant::now());
-    std::thread::sleep(Duration::from_secs(3));
-    let used = (usage().unwrap() - before) as f64 / begun.elapsed().as_micros() as f64;
-    // Told ten times a second: a window may be off by one heartbeat.
-    assert!((0.05..=0.55).contains(&used), "{used} cores");
     let found: Value = serde_json::from_str(&docker(&["inspect", &container("d-spin")])).unwrap();
+    let pid = found[0]["State"]["Pid"].as_i64().unwrap().try_into().unwrap();
+    let accounts = Accounts::of(pid);
+    let heavy = Heavy::new(accounts.cpu.parent().unwrap());
+    accounts.assert_share(0.5);
+    drop(heavy);
+    let told = until("usage", || controller.usage("d-spin").filter(|usage| usage.cpu_millis > 0));
+    assert!(told.memory_bytes > 0, "{told:?}");
     let host = &found[0]["HostConfig"];
     assert_eq!(
         (host["Memory"].as_u64(), host["MemorySwap"].as_u64()),

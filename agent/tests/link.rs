@@ -72,7 +72,7 @@ fn the_node_says_what_it_is() {
         "--speed",
         "0.5",
     ];
-    let _agent = Agent::start_with(&controller, &args);
+    let mut agent = Agent::start_with(&controller, &args);
     let state = controller.state().unwrap();
     assert_eq!(state.sensors, ["kinect:ImageGen"]);
     assert_eq!(state.actuators, ["base:Drive"]);
@@ -83,6 +83,20 @@ fn the_node_says_what_it_is() {
     assert!(enforced.status, "{enforced:?}");
     assert!(state.runtimes.iter().any(|r| r.name == "process" && r.available));
     assert!(state.runtimes.iter().any(|r| r.name == "docker" && !r.available));
+    // Started again without a word, it is what it was; what is said then wins, field by field.
+    agent.terminate();
+    agent.args = vec!["--docker-socket".to_owned(), "none".to_owned()];
+    agent.spawn();
+    let again = controller.wait_hello(2).state.unwrap();
+    assert_eq!((&again.sensors, &again.actuators), (&state.sensors, &state.actuators));
+    assert_eq!(again.labels, state.labels);
+    assert_eq!((again.pose.unwrap().x, pose.y), (1.0, 2.0));
+    agent.terminate();
+    agent.args.extend(["--sr-res", "", "--label", "c=d"].map(str::to_owned));
+    agent.spawn();
+    let third = controller.wait_hello(3).state.unwrap();
+    assert_eq!((third.sensors.len(), &third.actuators), (0, &state.actuators));
+    assert!(third.labels.contains_key("c") && !third.labels.contains_key("a"));
 }
 
 #[test]
@@ -177,4 +191,24 @@ fn a_task_ordered_to_stop_before_it_came_never_starts() {
     let end = controller.wait_end("late");
     assert_eq!((end.attempt, end.reason.as_str()), (0, "Stopped"));
     assert!(!agent.task_dir("late").join("attempts").exists());
+}
+
+#[test]
+fn an_assignment_that_cannot_be_read_is_reported_once_as_failed() {
+    let controller = Controller::start();
+    let mut agent = Agent::start(&controller);
+    controller.assign("new", json!({ "run": { "wasm": { "module": "drive" } } }));
+    let end = controller.wait_end("new");
+    assert_eq!(
+        (end.phase(), end.reason.as_str(), end.attempt),
+        (proto::TaskPhase::Failed, "AssignmentUnreadable", 0)
+    );
+    assert!(end.message.contains("wasm") && end.finished_at.is_some(), "{end:?}");
+    // It is in the journal: another life of the agent says the same, and a release ends it.
+    agent.kill();
+    agent.spawn();
+    let again = controller.wait("new", "the same again", |again| again.sequence > end.sequence);
+    assert_eq!(proto::TaskReport { sequence: end.sequence, ..again }, end);
+    controller.release("new");
+    until("the task to go", || (!agent.task_dir("new").exists()).then_some(()));
 }

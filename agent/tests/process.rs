@@ -365,3 +365,29 @@ fn output_is_bounded_and_keeps_the_newest() {
     let numbers: Vec<u32> = text.lines().map(|line| line.parse().unwrap()).collect();
     assert!(numbers.len() > 1_000 && numbers.windows(2).all(|pair| pair[1] == pair[0] + 1));
 }
+
+#[test]
+fn the_groups_of_a_dead_agent_go_and_come_back_with_it() {
+    let controller = Controller::start();
+    let mut dead = Agent::start(&controller);
+    controller.assign("one", sh("exit 0"));
+    controller.wait_end("one");
+    let root = dead.group("one", 1, "cpu").parent().unwrap().to_owned();
+    dead.kill();
+    assert!(root.is_dir());
+    // Another agent's start takes them away, of this machine but of another directory.
+    let other = Controller::start();
+    let mut living = Agent::start(&other);
+    assert!(!root.exists(), "{}", root.display());
+    dead.spawn();
+    controller.wait_hello(2);
+    controller.assign("two", sh("exit 0"));
+    assert_eq!(controller.wait_end("two").exit_code, Some(0));
+    // One that lives keeps its own; one that ends in order, and has no tasks, takes them along.
+    living.terminate();
+    living.spawn();
+    other.wait_hello(2);
+    assert!(root.is_dir());
+    dead.terminate();
+    assert!(!root.exists(), "{}", root.display());
+}

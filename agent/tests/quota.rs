@@ -8,14 +8,10 @@ use std::time::{Duration, Instant};
 
 use common::agent::Agent;
 use common::controller::Controller;
+use common::cpu::Accounts;
 use common::until;
 use muster_api::wire::agent::v1 as proto;
 use serde_json::json;
-
-fn cpu_used(agent: &Agent, uid: &str) -> Duration {
-    let v1 = agent.group(uid, 1, "cpuacct").join("cpuacct.usage");
-    Duration::from_nanos(std::fs::read_to_string(v1).unwrap().trim().parse().unwrap())
-}
 
 #[test]
 fn half_a_core_is_half_a_core() {
@@ -29,15 +25,8 @@ fn half_a_core_is_half_a_core() {
         }),
     );
     controller.wait_running("spin");
-    // The quota is the most in every window; it is also what is got, in one that nobody disturbs.
-    until("a window at the quota", || {
-        let (before, begun) = (cpu_used(&agent, "spin"), Instant::now());
-        std::thread::sleep(Duration::from_secs(3));
-        let used = (cpu_used(&agent, "spin") - before).as_secs_f64();
-        let cores = used / begun.elapsed().as_secs_f64();
-        assert!(cores <= 0.53, "{cores} cores");
-        (cores >= 0.47).then_some(())
-    });
+    let group = |controller| agent.group("spin", 1, controller);
+    Accounts { cpuacct: group("cpuacct"), cpu: group("cpu") }.assert_share(0.5);
     let told = until("usage", || controller.usage("spin").filter(|usage| usage.cpu_millis > 0));
     assert!((50..=650).contains(&told.cpu_millis) && told.memory_bytes > 0, "{told:?}");
 }

@@ -43,6 +43,8 @@ pub enum Outcome {
     Launched(Started),
     /// It was not started, and will not be.
     LaunchFailed(Failure),
+    /// It was not started, and will not be before what it needs has been fetched.
+    Unprepared(Failure),
     /// Nobody knows whether it was started.
     LaunchUnclear,
     /// What was found of it.

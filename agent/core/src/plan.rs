@@ -16,8 +16,8 @@ pub struct Assignments {
     pub upserts: BTreeMap<TaskUid, Desired>,
     /// Tasks whose ends are recorded.
     pub released: BTreeSet<TaskUid>,
-    /// Tasks that were sent but could not be read: not started, and not taken for absent.
-    pub unreadable: BTreeSet<TaskUid>,
+    /// Tasks that were sent but could not be read, and why: not started, and not taken for absent.
+    pub unreadable: BTreeMap<TaskUid, String>,
 }
 
 /// One thing to do with the set of workloads.
@@ -25,6 +25,8 @@ pub struct Assignments {
 pub enum Step {
     /// A task that is new here.
     Create(TaskUid, Desired),
+    /// A task that is new here and cannot be read: its end is to be told, with this as the reason.
+    Refuse(TaskUid, String),
     /// An event for a known one.
     Tell(TaskUid, Event),
 }
@@ -36,6 +38,8 @@ pub enum Skipped {
     UnknownRelease(TaskUid),
     /// Wanted, but it is being removed: a uid never runs again after its release.
     BeingRemoved(TaskUid),
+    /// Known here, and what was sent now cannot be read: it goes on as it was last understood.
+    Unreadable(TaskUid, String),
 }
 
 /// What to do, and what was left undone and why.
@@ -61,11 +65,18 @@ pub fn plan(assignments: Assignments, known: &BTreeMap<TaskUid, bool>) -> Plan {
     if assignments.complete {
         let named = |uid: &TaskUid| {
             assignments.upserts.contains_key(uid)
-                || assignments.unreadable.contains(uid)
+                || assignments.unreadable.contains_key(uid)
                 || assignments.released.contains(uid)
         };
         for uid in known.keys().filter(|uid| !named(uid)) {
             plan.steps.push(Step::Tell(uid.clone(), Event::Forgotten));
+        }
+    }
+    for (uid, why) in assignments.unreadable {
+        if known.contains_key(&uid) {
+            plan.skipped.push(Skipped::Unreadable(uid, why));
+        } else if !assignments.released.contains(&uid) {
+            plan.steps.push(Step::Refuse(uid, why));
         }
     }
     for (uid, desired) in assignments.upserts {
@@ -114,15 +125,28 @@ mod tests {
     }
 
     #[test]
-    fn a_part_ends_nothing_and_what_cannot_be_read_is_kept() {
+    fn a_part_ends_nothing() {
         let known = BTreeMap::from([(uid("a"), false)]);
         assert_eq!(plan(Assignments::default(), &known), Plan::default());
+    }
+
+    #[test]
+    fn what_cannot_be_read_is_refused_once_and_ends_nothing() {
+        let why = || "run.wasm".to_owned();
         let unreadable = Assignments {
             complete: true,
-            unreadable: BTreeSet::from([uid("a")]),
+            unreadable: BTreeMap::from([(uid("a"), why()), (uid("b"), why())]),
             ..Assignments::default()
         };
-        assert_eq!(plan(unreadable, &known), Plan::default());
+        let known = BTreeMap::from([(uid("a"), false)]);
+        let first = plan(unreadable.clone(), &known);
+        assert_eq!(first.steps, [Step::Refuse(uid("b"), why())]);
+        assert_eq!(first.skipped, [Skipped::Unreadable(uid("a"), why())]);
+        let known = BTreeMap::from([(uid("a"), false), (uid("b"), false)]);
+        assert!(plan(unreadable.clone(), &known).steps.is_empty());
+        let released = Assignments { released: BTreeSet::from([uid("b")]), ..unreadable };
+        let known = BTreeMap::from([(uid("a"), false)]);
+        assert!(plan(released, &known).steps.is_empty());
     }
 
     #[test]

@@ -58,6 +58,8 @@ pub enum Reason {
     BackOff,
     /// It waits for contact with the controller (`onDisconnect: Stop`).
     AwaitingContact,
+    /// The agent could not read its assignment: a newer controller sent it.
+    AssignmentUnreadable,
     /// A runtime's own word (`ImagePullFailed`, `QuotaNotEnforced` …).
     Runtime(String),
 }
@@ -77,6 +79,7 @@ impl fmt::Display for Reason {
             Reason::ContainerLost => "ContainerLost",
             Reason::BackOff => "BackOff",
             Reason::AwaitingContact => "AwaitingContact",
+            Reason::AssignmentUnreadable => "AssignmentUnreadable",
             Reason::Runtime(word) => word,
         })
     }

@@ -1,8 +1,8 @@
 //! One task on this node: its state, and what to do about it.
 //!
 //! ```text
-//!            ┌──────────── back-off ───────────┐
-//! Waiting → Preparing → Launching → Running ───┤→ Ended → Removing → (forgotten)
+//!    ┌──────────────── back-off ───────────────┐
+//! Waiting → (Preparing ⇄) Launching → Running ─┤→ Ended → Removing → (forgotten)
 //!                 any live state → Stopping ───┘
 //! after a start of the agent: Launching|Running|Stopping → Recovering → one of them
 //! ```
@@ -14,7 +14,7 @@
 use muster_api::id::TaskUid;
 use serde::{Deserialize, Serialize};
 
-use crate::desired::Desired;
+use crate::desired::{Desired, RestartPolicy};
 pub use crate::event::{Context, Effect, Event, Failure, Outcome, Response};
 use crate::observed::{End, Exit, Loss, Observed, Started};
 use crate::report::{Content, Phase, Reason, Report, explain};
@@ -95,6 +95,18 @@ impl State {
     }
 }
 
+/// Whether a task's runtime has something to fetch (an image).
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Fetch {
+    /// Nothing, ever.
+    Nothing,
+    /// What a launch turns out to miss. Asking first would cost every start a question whose answer
+    /// is nearly always no.
+    Missing,
+    /// Before every attempt.
+    Always,
+}
+
 /// One task on this node. All of it is durable.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Workload {
@@ -102,8 +114,14 @@ pub struct Workload {
     pub uid: TaskUid,
     /// What the controller wants.
     pub desired: Desired,
-    /// Whether its runtime has to fetch something before a launch.
+    /// Whether its runtime may have to fetch something before a launch.
     pub prepare: bool,
+    /// It fetches before every attempt, not only when a launch says that something is missing.
+    #[serde(default)]
+    pub fetch_always: bool,
+    /// For the present try, it has.
+    #[serde(default)]
+    pub fetched: bool,
     /// It is to be removed as soon as nothing of it is left.
     pub forgotten: bool,
     /// Where it is.
@@ -125,25 +143,48 @@ impl Workload {
     pub fn assigned(
         uid: TaskUid,
         desired: Desired,
-        prepare: bool,
+        fetch: Fetch,
         context: Context,
     ) -> (Workload, Response) {
-        let mut workload = Workload {
+        let state = State::Waiting { until: context.now.boot };
+        let mut workload = Workload::new(uid, desired, fetch, state);
+        let mut effects = Vec::new();
+        workload.move_on(context, &mut effects);
+        let response = workload.changed(effects);
+        (workload, response)
+    }
+
+    /// A task whose assignment cannot be read: it ends before it begins, and says why. `message`
+    /// names the field.
+    pub fn unreadable(uid: TaskUid, message: String, context: Context) -> (Workload, Response) {
+        let desired =
+            Desired { restart: RestartPolicy::Never, grace_ms: 0, stop_after_ms: None, stop: None };
+        let mut workload = Workload::new(uid, desired, Fetch::Nothing, State::Ended);
+        let mut content = workload.report_draft();
+        content.phase = Phase::Failed;
+        content.reason = Reason::AssignmentUnreadable;
+        content.message = message;
+        content.finished_at = Some(context.now.wall);
+        workload.report.update(content);
+        let response = workload.changed(Vec::new());
+        (workload, response)
+    }
+
+    fn new(uid: TaskUid, desired: Desired, fetch: Fetch, state: State) -> Workload {
+        Workload {
             uid,
             desired,
-            prepare,
+            prepare: fetch != Fetch::Nothing,
+            fetch_always: fetch == Fetch::Always,
+            fetched: false,
             forgotten: false,
-            state: State::Waiting { until: context.now.boot },
+            state,
             attempt: 0,
             unused: false,
             restarts: 0,
             failures: 0,
             report: Report::accepted(),
-        };
-        let mut effects = Vec::new();
-        workload.move_on(context, &mut effects);
-        let response = workload.changed(effects);
-        (workload, response)
+        }
     }
 
     /// A task read back after the agent was started anew. `same_boot`: the machine was not.
@@ -246,7 +287,17 @@ impl Workload {
 
     fn on_outcome(&mut self, outcome: Outcome, context: Context, effects: &mut Vec<Effect>) {
         match (&self.state, outcome) {
-            (State::Preparing, Outcome::Prepared) => self.launch(effects),
+            (State::Preparing, Outcome::Prepared) => {
+                self.fetched = true;
+                self.launch(effects);
+            }
+            // It will not be fetched for ever: what is still missing then is a failure.
+            (State::Launching, Outcome::Unprepared(failure))
+                if self.fetched || self.forgotten || self.desired.stop.is_some() =>
+            {
+                self.on_failure(&failure, context, effects);
+            }
+            (State::Launching, Outcome::Unprepared(_)) => self.prepare(effects),
             (State::Preparing, Outcome::PrepareFailed(failure))
             | (State::Launching, Outcome::LaunchFailed(failure)) => {
                 self.on_failure(&failure, context, effects);
@@ -301,9 +352,9 @@ impl Workload {
             if !std::mem::take(&mut self.unused) {
                 self.attempt += 1;
             }
-            if self.prepare {
-                self.state = State::Preparing;
-                effects.push(Effect::Prepare(self.attempt));
+            self.fetched = false;
+            if self.fetch_always {
+                self.prepare(effects);
             } else {
                 self.launch(effects);
             }
@@ -315,6 +366,11 @@ impl Workload {
     fn in_contact(&self, context: Context) -> bool {
         let Some(limit) = self.desired.stop_after_ms else { return true };
         context.contact.is_some_and(|at| context.now.boot.0.saturating_sub(at.0) < limit)
+    }
+
+    fn prepare(&mut self, effects: &mut Vec<Effect>) {
+        self.state = State::Preparing;
+        effects.push(Effect::Prepare(self.attempt));
     }
 
     fn launch(&mut self, effects: &mut Vec<Effect>) {

@@ -9,7 +9,7 @@ use muster_agent_core::observed::{End, Exit, Observed, Started};
 use muster_agent_core::report::Report;
 use muster_agent_core::time::{Boot, Now, Wall};
 use muster_agent_core::workload::{
-    Context, Effect, Event, Failure, Outcome, Response, State, Workload,
+    Context, Effect, Event, Failure, Fetch, Outcome, Response, State, Workload,
 };
 use muster_api::id::TaskUid;
 use proptest::prelude::*;
@@ -28,6 +28,8 @@ enum Action {
     /// A launch happens, and the agent dies before its answer.
     LaunchAndCrash,
     Reboot,
+    /// What its runtime fetched is gone.
+    Evict,
     /// The program ends by itself.
     Ends(i32),
     Pass(u64),
@@ -45,12 +47,17 @@ fn action() -> impl Strategy<Value = Action> {
         2 => Just(Action::Crash),
         1 => Just(Action::LaunchAndCrash),
         1 => Just(Action::Reboot),
+        1 => Just(Action::Evict),
         4 => prop_oneof![Just(0), Just(1)].prop_map(Action::Ends),
         4 => (1..400_000_u64).prop_map(Action::Pass),
         1 => (0..20_000_u64).prop_map(Action::Stop),
         1 => Just(Action::Forget),
         1 => policy().prop_map(Action::Wish),
     ]
+}
+
+fn fetch() -> impl Strategy<Value = Fetch> {
+    prop_oneof![Just(Fetch::Nothing), Just(Fetch::Missing), Just(Fetch::Always)]
 }
 
 fn policy() -> impl Strategy<Value = RestartPolicy> {
@@ -70,6 +77,9 @@ enum Attempt {
 
 struct World {
     now: u64,
+    fetch: Fetch,
+    /// What a launch needs is not here.
+    missing: bool,
     desired: Desired,
     attempts: BTreeMap<u32, Attempt>,
     durable: Option<(Workload, u64)>,
@@ -83,10 +93,12 @@ struct World {
 }
 
 impl World {
-    fn new(policy: RestartPolicy, prepare: bool) -> World {
+    fn new(policy: RestartPolicy, fetch: Fetch) -> World {
         let desired = Desired { restart: policy, grace_ms: 1_000, stop_after_ms: None, stop: None };
         let mut world = World {
             now: 0,
+            fetch,
+            missing: fetch != Fetch::Nothing,
             desired: desired.clone(),
             attempts: BTreeMap::new(),
             durable: None,
@@ -99,7 +111,7 @@ impl World {
             dropped: false,
         };
         let (workload, response) =
-            Workload::assigned(TaskUid::new("t"), desired, prepare, world.context());
+            Workload::assigned(TaskUid::new("t"), desired, fetch, world.context());
         world.agent = Some(workload);
         world.carry_out(response);
         world
@@ -208,13 +220,19 @@ impl World {
             }
             Effect::Prepare(attempt) => {
                 self.under_way.remove(index);
-                let failed = Outcome::PrepareFailed(failure);
-                self.answer(attempt, if fail { failed } else { Outcome::Prepared });
+                if fail {
+                    return self.answer(attempt, Outcome::PrepareFailed(failure));
+                }
+                self.missing = false;
+                self.answer(attempt, Outcome::Prepared);
             }
             Effect::Launch(attempt) => {
                 self.under_way.remove(index);
                 if fail {
                     return self.answer(attempt, Outcome::LaunchFailed(failure));
+                }
+                if self.missing {
+                    return self.answer(attempt, Outcome::Unprepared(failure));
                 }
                 self.begin(attempt);
                 self.answer(attempt, Outcome::Launched(Started { at: Wall(0) }));
@@ -239,6 +257,9 @@ impl World {
     }
 
     fn unclear(&mut self, index: usize) {
+        if self.missing {
+            return;
+        }
         if let Some(Effect::Launch(attempt)) = self.under_way.get(index).cloned() {
             self.under_way.remove(index);
             self.begin(attempt);
@@ -257,7 +278,7 @@ impl World {
         let Some((mut workload, boot)) = self.durable.clone() else {
             // Nothing was written: the controller assigns it anew.
             let (workload, response) =
-                Workload::assigned(TaskUid::new("t"), self.desired.clone(), false, context);
+                Workload::assigned(TaskUid::new("t"), self.desired.clone(), self.fetch, context);
             self.agent = Some(workload);
             return self.carry_out(response);
         };
@@ -290,7 +311,7 @@ impl World {
                     Effect::Launch(attempt) => Some(*attempt),
                     _ => None,
                 });
-                if let Some(attempt) = launch {
+                if let Some(attempt) = launch.filter(|_| !self.missing) {
                     self.begin(attempt);
                     self.crash();
                 }
@@ -306,6 +327,7 @@ impl World {
                 }
                 self.crash();
             }
+            Action::Evict => self.missing = self.fetch != Fetch::Nothing,
             Action::Ends(code) => self.end_live(End::Exited(code)),
             Action::Pass(millis) => {
                 self.now += millis;
@@ -344,10 +366,10 @@ proptest! {
     #[test]
     fn a_task_runs_once_at_a_time_and_ends_when_told(
         policy in policy(),
-        prepare in any::<bool>(),
+        fetch in fetch(),
         actions in prop::collection::vec(action(), 1..60),
     ) {
-        let mut world = World::new(policy, prepare);
+        let mut world = World::new(policy, fetch);
         for action in actions {
             world.act(action);
             prop_assert!(world.live() <= 1);
@@ -366,7 +388,7 @@ proptest! {
 
     #[test]
     fn an_always_task_comes_back_after_every_end(ends in prop::collection::vec(0..3_i32, 1..8)) {
-        let mut world = World::new(RestartPolicy::Always, false);
+        let mut world = World::new(RestartPolicy::Always, Fetch::Nothing);
         world.settle();
         for (number, code) in (1_u32..).zip(&ends) {
             prop_assert_eq!(world.live(), 1);

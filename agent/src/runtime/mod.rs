@@ -38,6 +38,8 @@ pub(crate) enum Launched {
     Ended(Exit),
     /// Nothing was started, and nothing will be.
     Refused(Failure),
+    /// Nothing was started: what it needs has to be fetched first, with [`Runtime::prepare`].
+    Unprepared(Failure),
     /// It may or may not have been started: ask with [`Runtime::find`].
     Unclear(RuntimeError),
 }

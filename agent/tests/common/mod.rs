@@ -1,5 +1,5 @@
 //! What the agent's tests stand on: a controller that does what the test says ([`controller`]), agents as
-//! real processes ([`agent`]), and looking until something is so ([`until`]).
+//! real processes ([`agent`]), the kernel's accounts ([`cpu`]), and looking until something is so ([`until`]).
 #![allow(dead_code, reason = "each test binary uses its own part")]
 #![allow(
     clippy::unwrap_used,
@@ -11,6 +11,7 @@
 
 pub mod agent;
 pub mod controller;
+pub mod cpu;
 
 use std::time::{Duration, Instant};
 

@@ -1,5 +1,6 @@
 //! The process runtime on cgroup v2, which is what robots run: a small guest with Debian's kernel, an
-//! initramfs with the daemons, and in it the same end-to-end tests as on this machine.
+//! initramfs with the daemons, and in it the same end-to-end tests as on this machine: at the tree's
+//! root, and in a group of the agent's own, as systemd makes one for a service.
 //!
 //! The guest has no disk and no network; what it says comes over its serial line.
 
@@ -12,7 +13,7 @@ use std::process::{Command, Stdio};
 
 use archive::Archive;
 
-/// Printed by the guest's init before the tests' exit code.
+/// Printed by the guest's init before the exit codes of the tests at the root and in a group.
 const VERDICT: &str = "guest tests ended with ";
 
 const INIT: &str = r#"#!/bin/sh
@@ -23,8 +24,30 @@ mount -t devtmpfs dev /dev
 mount -t cgroup2 cgroup /sys/fs/cgroup
 mount -t tmpfs tmp /tmp
 ip link set lo up
+ln -s /t/agent/muster-agent /t/muster-agent
 /t/deps/e2e process --nocapture --test-threads=1
-echo "guest tests ended with $?"
+plain=$?
+rm /t/muster-agent
+
+# As under systemd: a group for each start of the service, and the agent alone in it.
+slice=/sys/fs/cgroup/system.slice
+mkdir $slice
+for controller in cpu memory pids io; do
+  for dir in /sys/fs/cgroup $slice; do echo +$controller > $dir/cgroup.subtree_control; done
+done
+cat > /t/muster-agent <<'EOF'
+#!/bin/sh
+service=/sys/fs/cgroup/system.slice/muster-agent-$$.service
+mkdir $service && echo $$ > $service/cgroup.procs && exec /t/agent/muster-agent "$@"
+EOF
+chmod 755 /t/muster-agent
+rmdir /sys/fs/cgroup/muster/* /sys/fs/cgroup/muster
+/t/deps/e2e process::a_spinning --nocapture --test-threads=1
+service=$?
+ls -d $slice/muster-agent-*.service/muster/*/agent || service=1
+[ ! -e /sys/fs/cgroup/muster ] || service=1
+
+echo "guest tests ended with $plain$service"
 poweroff -f
 "#;
 
@@ -80,7 +103,7 @@ fn initramfs() -> Vec<u8> {
     let e2e = e2e();
     let profile = e2e.parent().and_then(Path::parent).expect("target/PROFILE/deps").to_owned();
     let mut archive = Archive::default();
-    for dir in ["bin", "dev", "proc", "sys", "tmp", "t", "t/deps", "lib", "lib64"] {
+    for dir in ["bin", "dev", "proc", "sys", "tmp", "t", "t/deps", "t/agent", "lib", "lib64"] {
         archive.directory(dir);
     }
     archive.file("init", INIT.as_bytes(), 0o755);
@@ -89,12 +112,15 @@ fn initramfs() -> Vec<u8> {
         &fs::read("/bin/busybox").expect("busybox-static is installed"),
         0o755,
     );
-    for applet in ["sh", "mount", "ip", "echo", "poweroff", "sleep", "awk", "kill", "setsid"] {
+    for applet in [
+        "sh", "mount", "ip", "echo", "poweroff", "sleep", "awk", "kill", "setsid", "ln", "rm",
+        "rmdir", "mkdir", "cat", "chmod", "ls", "[",
+    ] {
         archive.link(&format!("bin/{applet}"), "busybox");
     }
     let binaries = [
         ("t/deps/e2e", e2e),
-        ("t/muster-agent", profile.join("muster-agent")),
+        ("t/agent/muster-agent", profile.join("muster-agent")),
         ("t/muster-controller", profile.join("muster-controller")),
     ];
     let mut needed: Vec<PathBuf> = Vec::new();
@@ -132,6 +158,7 @@ fn the_process_runtime_holds_quotas_on_cgroup_v2() {
         .expect("qemu is installed (tests/run installs qemu-system-x86)");
     let said = String::from_utf8_lossy(&guest.stdout);
     let verdict = said.lines().find_map(|l| l.trim().strip_prefix(VERDICT));
-    assert_eq!(verdict, Some("0"), "{said}\n{}", String::from_utf8_lossy(&guest.stderr));
-    assert!(said.contains("test result: ok. 2 passed"), "both tests ran: {said}");
+    assert_eq!(verdict, Some("00"), "{said}\n{}", String::from_utf8_lossy(&guest.stderr));
+    assert!(said.contains("test result: ok. 2 passed"), "both tests ran at the root: {said}");
+    assert!(said.contains("test result: ok. 1 passed"), "one ran in a service's group: {said}");
 }

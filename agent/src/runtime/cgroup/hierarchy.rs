@@ -1,9 +1,8 @@
 //! What is mounted where, and where this agent may make groups.
 //!
 //! The base is the agent's own group in each hierarchy, so that limits that were put on the agent
-//! (a service, a container) hold for its tasks as well; below it `muster/<identity>`. On v2 a group
-//! with processes cannot hand controllers to its children: an agent that is alone in its group
-//! steps into a leaf of it; one that is not alone takes the root of the tree, as the kubelet does.
+//! (a service, a container) hold for its tasks as well; below it `muster/<identity>`. On v2 not every
+//! group can be a base: see `place`.
 
 use std::collections::BTreeMap;
 use std::io;
@@ -11,6 +10,7 @@ use std::path::{Path, PathBuf};
 
 use super::Controller;
 use super::group::Group;
+use super::place::Base;
 
 /// The leaf that holds the agent itself on v2.
 pub(crate) const AGENT_LEAF: &str = "agent";
@@ -50,18 +50,18 @@ pub(crate) enum HierarchyError {
         #[source]
         source: io::Error,
     },
+    #[error("{dir} is held by another agent: two agents have one identity, or one stands still")]
+    Held { dir: PathBuf },
 }
 
 /// Where this agent's groups are.
 #[derive(Debug)]
 pub(crate) struct Hierarchy {
     version: Version,
-    /// Mount point of each controller.
-    mounts: BTreeMap<Controller, PathBuf>,
     /// The directory that this agent's groups are made in, by controller.
     roots: BTreeMap<Controller, PathBuf>,
-    /// v2: the group that controllers are handed down from; the agent's own or the root.
-    base: Option<PathBuf>,
+    /// v2: the group that controllers are handed down from.
+    base: Option<Base>,
 }
 
 struct Mount {
@@ -101,7 +101,7 @@ impl Hierarchy {
     }
 
     fn v1(mounts: &[Mount], own: &str, below: &Path) -> Result<Hierarchy, HierarchyError> {
-        let (mut points, mut roots) = (BTreeMap::new(), BTreeMap::new());
+        let mut roots = BTreeMap::new();
         for (controller, name) in V1 {
             let found = mounts.iter().find(|m| !m.v2 && m.options.iter().any(|o| o == name));
             let Some(mount) = found else {
@@ -113,24 +113,17 @@ impl Hierarchy {
                 continue;
             };
             let base = below_mount(mount, &own_path(own, Some(name)), below);
-            points.insert(controller, mount.point.clone());
             roots.insert(controller, base.join(below));
         }
-        Ok(Hierarchy { version: Version::V1, mounts: points, roots, base: None })
+        Ok(Hierarchy { version: Version::V1, roots, base: None })
     }
 
     fn v2(mount: &Mount, own: &str, below: &Path) -> Hierarchy {
-        let mut base = below_mount(mount, &own_path(own, None), below);
-        if base != mount.point && !alone_in(&base) {
-            base.clone_from(&mount.point);
-        }
-        let each = |dir: &Path| V2.iter().map(|(c, _)| (*c, dir.to_owned())).collect();
-        Hierarchy {
-            version: Version::V2,
-            mounts: each(&mount.point),
-            roots: each(&base.join(below)),
-            base: Some(base),
-        }
+        let own = below_mount(mount, &own_path(own, None), below);
+        let base = Base::find(&own, &mount.point);
+        let root = base.dir.join(below);
+        let roots = V2.iter().map(|(controller, _)| (*controller, root.clone())).collect();
+        Hierarchy { version: Version::V2, roots, base: Some(base) }
     }
 
     /// Makes the roots, and on v2 hands the controllers down to them.
@@ -163,15 +156,11 @@ impl Hierarchy {
         Ok(())
     }
 
-    fn hand_down(&self, base: &Path) -> Result<(), HierarchyError> {
+    fn hand_down(&self, base: &Base) -> Result<(), HierarchyError> {
         let Some(root) = self.roots.values().next() else { return Ok(()) };
-        let is_tree_root = self.mounts.values().any(|point| point == base);
-        if !is_tree_root {
-            let leaf = root.join(AGENT_LEAF);
-            let denied = |source| HierarchyError::Denied { dir: leaf.clone(), source };
-            std::fs::create_dir_all(&leaf).map_err(denied)?;
-            std::fs::write(leaf.join("cgroup.procs"), "0").map_err(denied)?;
-        }
+        let leaf = root.join(AGENT_LEAF);
+        base.clear(&leaf).map_err(|source| HierarchyError::Denied { dir: leaf, source })?;
+        let base = base.dir.as_path();
         let mut dir = base.to_owned();
         let below = root.strip_prefix(base).unwrap_or_else(|_| Path::new(""));
         for part in std::iter::once(None).chain(below.components().map(Some)) {
@@ -181,6 +170,24 @@ impl Hierarchy {
             enable(&dir)?;
         }
         Ok(())
+    }
+
+    /// Takes back what `make_roots` made, as far as nothing uses it.
+    pub(super) fn remove_roots(&self) {
+        if let (Some(base), Some(root)) = (&self.base, self.roots.values().next())
+            && let Err(error) = base.restore(root, &root.join(AGENT_LEAF))
+        {
+            tracing::debug!(%error, "the agent stays in its leaf");
+        }
+        for root in self.distinct_roots().into_iter().rev() {
+            // Tasks stay, and so does the root that holds their groups.
+            let _ = std::fs::remove_dir(root);
+        }
+    }
+
+    #[cfg(test)]
+    pub(super) fn of(version: Version, roots: BTreeMap<Controller, PathBuf>) -> Hierarchy {
+        Hierarchy { version, roots, base: None }
     }
 
     pub(crate) fn version(&self) -> Version {
@@ -262,12 +269,6 @@ fn read(path: &str, file: &'static str) -> Result<String, HierarchyError> {
 fn has_controllers(point: &Path) -> bool {
     let list = std::fs::read_to_string(point.join("cgroup.controllers")).unwrap_or_default();
     ["cpu", "memory"].iter().all(|name| list.split_whitespace().any(|have| have == *name))
-}
-
-fn alone_in(dir: &Path) -> bool {
-    let me = std::process::id();
-    let Ok(procs) = std::fs::read_to_string(dir.join("cgroup.procs")) else { return false };
-    procs.lines().all(|line| line.trim().parse() == Ok(me))
 }
 
 fn parse_mounts(mountinfo: &str) -> Vec<Mount> {

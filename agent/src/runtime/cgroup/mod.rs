@@ -4,6 +4,8 @@
 //! | module | holds |
 //! |---|---|
 //! | [`hierarchy`] | what is mounted where, and where this agent may make groups |
+//! | [`place`] | v2: below which group |
+//! | [`claim`] | which roots are whose; removing those of dead agents |
 //! | [`limits`] | limits → kernel files, through cgroups-rs' controllers; each one read back |
 //! | [`group`] | a made group: enter, list, freeze, kill, evidence of OOM, usage, remove |
 //! | [`device`] | the block device under a directory, for I/O rates |
@@ -11,10 +13,12 @@
 //! `cgroups-rs` writes the limits; it is kept away from the rest: its builder swallows errors, its
 //! v2 root is fixed, and its delete sleeps.
 
+mod claim;
 pub(crate) mod device;
 pub(crate) mod group;
 pub(crate) mod hierarchy;
 pub(crate) mod limits;
+mod place;
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -58,6 +62,8 @@ pub(crate) trait Enforcer: Send + Sync + std::fmt::Debug {
 #[derive(Debug)]
 pub(crate) struct Kernel {
     hierarchy: Hierarchy,
+    /// For life: other agents know by it that this one lives.
+    _claim: Option<claim::Held>,
 }
 
 impl Kernel {
@@ -65,8 +71,11 @@ impl Kernel {
     /// directory's, so that agents with different directories never see one another's groups.
     pub(crate) fn open(identity: &str) -> Result<Kernel, HierarchyError> {
         let hierarchy = Hierarchy::detect(identity)?;
+        let _gate = hierarchy.gate()?;
         hierarchy.make_roots()?;
-        Ok(Kernel { hierarchy })
+        let claim = hierarchy.claim()?;
+        hierarchy.sweep_dead();
+        Ok(Kernel { hierarchy, _claim: claim })
     }
 
     /// Where docker's containers would be found: the mounts by controller.
@@ -83,9 +92,12 @@ impl Kernel {
 
 impl Enforcer for Kernel {
     fn retire(&self) {
-        for root in self.hierarchy.roots().values() {
-            // Tasks stay, and so does the root that holds their groups.
-            let _ = std::fs::remove_dir(root);
+        match self.hierarchy.gate() {
+            Ok(_gate) => {
+                self.hierarchy.sweep_dead();
+                self.hierarchy.remove_roots();
+            }
+            Err(error) => tracing::warn!(%error, "the agent's own groups stay behind"),
         }
     }
 

@@ -74,6 +74,15 @@ pub(super) fn refusal(error: &Error) -> Option<(u16, String)> {
     }
 }
 
+/// The engine was not reached: whatever was asked for has not happened.
+pub(super) fn never_sent(error: &Error) -> bool {
+    match error {
+        Error::HyperLegacyError { err } => err.is_connect(),
+        Error::SocketNotFoundError(_) => true,
+        _ => false,
+    }
+}
+
 pub(super) fn is_missing(error: &Error) -> bool {
     matches!(refusal(error), Some((404, _)))
 }

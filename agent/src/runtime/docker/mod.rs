@@ -164,8 +164,12 @@ impl DockerRuntime {
         if let Err(error) = docker.create_container(Some(options), body).await {
             return match inspect::refusal(&error) {
                 Some((409, _)) => Launched::Unclear(RuntimeError::new("create a container", error)),
-                Some((404, message)) => refused("ImageMissing", message, true),
+                Some((404, message)) => {
+                    let reason = "ImageMissing".to_owned();
+                    Launched::Unprepared(Failure { reason, message, retry: true })
+                }
                 Some((_, message)) => refused("CreateContainerError", message, false),
+                None if inspect::never_sent(&error) => Launched::Refused(self.unavailable(&error)),
                 None => Launched::Unclear(RuntimeError::new("create a container", error)),
             };
         }

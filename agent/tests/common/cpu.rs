@@ -1,0 +1,86 @@
+//! A group's share of the cpu, from the kernel's own accounts (cgroup v1).
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+use super::until;
+
+/// How far from its quota a spinning task may be found, cores.
+const BAR: f64 = 0.03;
+
+/// Thirty periods of the engine's quota: the one that is cut in two at each end is lost in the bar.
+const WINDOW: Duration = Duration::from_secs(3);
+
+/// Where the accounts of a group are.
+pub struct Accounts {
+    pub cpuacct: PathBuf,
+    pub cpu: PathBuf,
+}
+
+impl Accounts {
+    /// Those of the group that a process is in.
+    pub fn of(pid: i32) -> Accounts {
+        let text = std::fs::read_to_string(format!("/proc/{pid}/cgroup")).unwrap();
+        let dir = |controller: &str| {
+            let mut lines = text.lines().map(|line| line.splitn(3, ':').collect::<Vec<_>>());
+            let line = lines.find(|line| line[1].split(',').any(|have| have == controller));
+            let line = line.unwrap();
+            PathBuf::from(format!("/sys/fs/cgroup/{}{}", line[1], line[2]))
+        };
+        Accounts { cpuacct: dir("cpuacct"), cpu: dir("cpu") }
+    }
+
+    fn used(&self) -> Duration {
+        let nanos = std::fs::read_to_string(self.cpuacct.join("cpuacct.usage")).unwrap();
+        Duration::from_nanos(nanos.trim().parse().unwrap())
+    }
+
+    /// Periods of the quota in which it ran, and those in which it came to its quota.
+    fn periods(&self) -> (u64, u64) {
+        let text = std::fs::read_to_string(self.cpu.join("cpu.stat")).unwrap();
+        let stat: BTreeMap<&str, &str> =
+            text.lines().filter_map(|line| line.split_once(' ')).collect();
+        (stat["nr_periods"].parse().unwrap(), stat["nr_throttled"].parse().unwrap())
+    }
+
+    /// A task that spins gets `cores`, no more in any window, and no less in one in which the rest of
+    /// the machine lets it: then the kernel stopped it at its quota in (nearly) every period.
+    #[track_caller]
+    pub fn assert_share(&self, cores: f64) {
+        until("a window in which the task was not starved", || {
+            let (used, periods, begun) = (self.used(), self.periods(), Instant::now());
+            std::thread::sleep(WINDOW);
+            let got = (self.used() - used).as_secs_f64() / begun.elapsed().as_secs_f64();
+            let now = self.periods();
+            let (ran, full) = (now.0 - periods.0, now.1 - periods.1);
+            let said = format!("{got:.3} cores, at the quota in {full} of {ran} periods");
+            assert!(got <= cores + BAR, "{said}");
+            let starved = (ran - full.min(ran)) * 30 > ran;
+            assert!(starved || got >= cores - BAR, "{said}");
+            (got >= cores - BAR).then_some(())
+        });
+    }
+}
+
+/// Lets a group weigh as much as the machine; dropped: as much as before. The engine's own group weighs
+/// like one process of the host, and beside a build its containers would not come to their quotas.
+pub struct Heavy {
+    file: PathBuf,
+    before: String,
+}
+
+impl Heavy {
+    pub fn new(group: &Path) -> Heavy {
+        let file = group.join("cpu.shares");
+        let before = std::fs::read_to_string(&file).unwrap();
+        std::fs::write(&file, "262144").unwrap();
+        Heavy { file, before }
+    }
+}
+
+impl Drop for Heavy {
+    fn drop(&mut self) {
+        let _ = std::fs::write(&self.file, &self.before);
+    }
+}
