@@ -18,7 +18,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let agent = protox::compile([package("agent")], [root])?;
     let sessions = protox::compile([package("framework"), package("executor")], [root])?;
     let plain = || tonic_prost_build::configure().build_client(false).build_server(false);
-    plain().compile_fds(agent)?;
+    plain().bytes(".muster.agent.v1.Message.data").compile_fds(agent)?;
     plain()
         .bytes(".")
         .compile_well_known_types(true)

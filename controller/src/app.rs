@@ -27,6 +27,9 @@ use crate::events::{self, Happening, Recorder};
 use crate::pki::{Pki, PkiError};
 use crate::serve::Server;
 use crate::session::agents::Agents;
+use crate::session::frameworks::proto::framework_service_server::FrameworkServiceServer;
+use crate::session::frameworks::service::Service;
+use crate::session::frameworks::{Frameworks, MAX_WIRE, lines};
 use crate::session::logs::SessionLogs;
 use crate::session::{self, Sessions};
 use crate::store::{self, OpenError, StoreError};
@@ -162,9 +165,17 @@ fn spawn_background(
         context: Arc::downgrade(context),
         sessions: Arc::clone(&sessions),
     }));
+    let frameworks = Arc::new(Frameworks::new(
+        Arc::clone(context),
+        reconcilers.scheduler.clone(),
+        Arc::clone(&sessions),
+        background.clone(),
+    ));
+    reconcile::spawn_for_frameworks(context, &frameworks, background);
     context.set_live(Live {
         scheduler: reconcilers.scheduler.clone(),
         sessions: Arc::clone(&sessions),
+        frameworks,
     });
     Agents::new(Arc::clone(context), sessions, reconcilers.scheduler, background.clone())
 }
@@ -172,11 +183,22 @@ fn spawn_background(
 /// REST and gRPC as one router.
 fn router(context: &Arc<Context>, agents: Agents) -> Router {
     // Mounted by path, because the fallback of tonic's own router answers 200 to what it does not know.
+    let frameworks = context.live().map(|live| Arc::clone(&live.frameworks));
+    let frameworks = frameworks.map(|frameworks| {
+        let service = FrameworkServiceServer::new(Service(Arc::clone(&frameworks)))
+            .max_decoding_message_size(MAX_WIRE)
+            .max_encoding_message_size(MAX_WIRE);
+        Router::new()
+            .route_service("/muster.framework.v1.FrameworkService/{*method}", service)
+            .merge(lines::router(frameworks))
+    });
     Router::new()
         .route_service(
             "/muster.agent.v1.AgentService/{*method}",
-            session::proto::agent_service_server::AgentServiceServer::new(agents),
+            session::proto::agent_service_server::AgentServiceServer::new(agents)
+                .max_decoding_message_size(MAX_WIRE),
         )
+        .merge(frameworks.unwrap_or_default())
         .merge(rest::router(Arc::clone(context)))
 }
 

@@ -14,6 +14,7 @@ use crate::pki::Pki;
 use crate::reconcile::schedule;
 use crate::rest::log::LogSource;
 use crate::session::Sessions;
+use crate::session::frameworks::Frameworks;
 use crate::store::Store;
 
 /// Where "now" comes from; tests hold it still.
@@ -61,6 +62,8 @@ pub struct Live {
     pub scheduler: schedule::Handle,
     /// Who is connected, and what is used.
     pub sessions: Arc<Sessions>,
+    /// Who takes offers.
+    pub frameworks: Arc<Frameworks>,
 }
 
 impl Context {

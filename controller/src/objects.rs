@@ -18,6 +18,10 @@ use crate::store::{Key, Op, Precondition, Resource, Store, StoreError, Stored};
 pub const NODES: Resource = Resource::new("nodes");
 /// Tasks.
 pub const TASKS: Resource = Resource::new("tasks");
+/// Frameworks.
+pub const FRAMEWORKS: Resource = Resource::new("frameworks");
+/// Quotas.
+pub const QUOTAS: Resource = Resource::new("quotas");
 /// Leases.
 pub const LEASES: Resource = Resource::new("leases");
 /// Events.

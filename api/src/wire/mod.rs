@@ -3,6 +3,7 @@
 
 pub mod agent_session;
 mod error;
+pub mod framework_session;
 
 pub use error::WireError;
 

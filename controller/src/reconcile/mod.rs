@@ -4,14 +4,19 @@
 //! | loop | looks at | does |
 //! |---|---|---|
 //! | [`schedule`] | Nodes, Tasks, Leases | binds Pending tasks, or writes why not |
+//! | [`desk`] | frameworks, in [`schedule`]'s own task | shows offers, takes Accepts |
+//! | [`failover`] | Frameworks | removes those that stay away, writes their numbers |
 //! | [`books`] | the scheduler's ledger | writes used, free and leases into Node status |
 //! | [`health`] | heartbeats | marks silent nodes and their tasks |
 //! | [`deletion`] | Tasks being deleted | removes those whose processes are gone |
 //! | [`garbage`] | ownerReferences | deletes what lost its owner |
 //! | [`history`] | Events, the store's history | forgets what is old |
 
+mod bind;
 pub mod books;
 pub mod deletion;
+pub mod desk;
+pub mod failover;
 pub mod garbage;
 pub mod health;
 pub mod history;
@@ -24,6 +29,7 @@ use tokio_util::task::TaskTracker;
 
 use crate::context::Context;
 use crate::session::Sessions;
+use crate::session::frameworks::{Frameworks, updates};
 use crate::store::{Store, WatchEnd, WatchError, Watcher};
 
 /// How long a loop waits after the store failed before it tries again. Commits fail when the disk
@@ -59,6 +65,18 @@ pub fn spawn(context: &Arc<Context>, sessions: &Arc<Sessions>, tasks: &TaskTrack
     run("history", Box::pin(history::run(Arc::clone(context))));
     run("board", Box::pin(crate::session::board::run(Arc::clone(context), Arc::clone(sessions))));
     Reconcilers { scheduler: handle }
+}
+
+/// Starts the loops that look after frameworks; they end as the others.
+pub fn spawn_for_frameworks(
+    context: &Arc<Context>,
+    frameworks: &Arc<Frameworks>,
+    tasks: &TaskTracker,
+) {
+    let failover = failover::run(Arc::clone(context), Arc::clone(frameworks));
+    let updates = updates::run(Arc::clone(context), Arc::clone(frameworks));
+    tasks.spawn(context.stop.clone().run_until_cancelled_owned(failover));
+    tasks.spawn(context.stop.clone().run_until_cancelled_owned(updates));
 }
 
 /// The next changes of a watcher, or none when it must begin anew: it fell behind, and only a look

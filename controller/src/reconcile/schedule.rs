@@ -15,15 +15,16 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use futures::future::join_all;
-use k8s_openapi::apimachinery::pkg::apis::meta::v1::MicroTime;
 use muster_api::id::TaskUid;
-use muster_api::kind::lease::{Lease, LeaseHolder, LeaseSpec, LeaseStatus};
+use muster_api::kind::lease::Lease;
 use muster_api::kind::node::Node;
-use muster_api::kind::task::{NodeRefusal, Task, TaskLease, TaskSpec, TaskStatus};
+use muster_api::kind::quota::Quota;
+use muster_api::kind::task::{NodeRefusal, Task, TaskSpec, TaskStatus};
 use muster_api::name::NodeName;
 use muster_api::phase::TaskPhase;
 use muster_api::pose::Pose;
 use muster_controller_core::cluster::Cluster;
+use muster_controller_core::fairness::Accounts;
 use muster_controller_core::ledger::Reservation;
 use muster_controller_core::recent::Recent;
 use muster_controller_core::schedule::{self, Bind, Demand, Wait};
@@ -32,10 +33,11 @@ use tokio::time::Instant;
 use tokio_util::task::AbortOnDropHandle;
 
 use super::books::{Books, Page};
-use super::{RETRY, next_events, watch_from_now};
+use super::desk::{self, Desk};
+use super::{RETRY, bind, next_events, watch_from_now};
 use crate::context::Context;
-use crate::objects::{self, LEASES, NODES, TASKS};
-use crate::store::{Change, Event, Key, Op, StoreError, Stored, Watcher};
+use crate::objects::{self, LEASES, NODES, QUOTAS, TASKS};
+use crate::store::{Change, Event, Op, StoreError, Stored, Watcher};
 
 /// How often changed numbers in a waiting task's reasons are written. New reasons are written at
 /// once; a reason whose numbers move with every bind would write without end.
@@ -47,6 +49,9 @@ const WHY_AT_ONCE: usize = 256;
 /// milliseconds: a few hundred keep both the disk and this task busy.
 const CHUNK: usize = 256;
 
+/// Questions that wait; they are answered between passes. 1024 poses are what 100 robots send in a second.
+const QUESTIONS: usize = 1024;
+
 type Committed = Result<Vec<Arc<Stored>>, StoreError>;
 
 /// A question to the scheduler.
@@ -55,9 +60,11 @@ enum Question {
     /// Where would these tasks go now?
     Plan { tasks: Vec<Demand>, answer: oneshot::Sender<schedule::Plan> },
     /// Why does this task wait? All nodes, not only those in its status.
-    Why { uid: TaskUid, spec: Arc<TaskSpec>, answer: oneshot::Sender<Vec<NodeRefusal>> },
+    Why { demand: Demand, answer: oneshot::Sender<Vec<NodeRefusal>> },
     /// A robot is somewhere else.
     Pose { node: NodeName, pose: Pose },
+    /// Something for the frameworks' desk.
+    Desk(desk::Request),
 }
 
 /// Asks the scheduler.
@@ -88,10 +95,19 @@ impl Handle {
     /// # Errors
     ///
     /// When the controller ends.
-    pub async fn why(&self, uid: TaskUid, spec: Arc<TaskSpec>) -> Result<Vec<NodeRefusal>, Ended> {
+    pub async fn why(&self, demand: Demand) -> Result<Vec<NodeRefusal>, Ended> {
         let (answer, answered) = oneshot::channel();
-        self.questions.send(Question::Why { uid, spec, answer }).await.map_err(|_| Ended)?;
+        self.questions.send(Question::Why { demand, answer }).await.map_err(|_| Ended)?;
         answered.await.map_err(|_| Ended)
+    }
+
+    /// Asks the frameworks' desk.
+    ///
+    /// # Errors
+    ///
+    /// When the controller ends.
+    pub async fn desk(&self, request: desk::Request) -> Result<(), Ended> {
+        self.questions.send(Question::Desk(request)).await.map_err(|_| Ended)
     }
 
     /// Says where a robot is now. Lost when the scheduler is busy: the next pose comes soon.
@@ -118,6 +134,7 @@ pub struct Scheduler {
     books: Arc<Books>,
     questions: mpsc::Receiver<Question>,
     cluster: Cluster,
+    desk: Desk,
     waiting: HashMap<TaskUid, Waiting>,
     specs: Recent<TaskSpec>,
     /// Revisions that this task wrote and the watcher has not brought yet.
@@ -130,9 +147,9 @@ impl Scheduler {
     /// A scheduler that knows nothing yet, and the handle to ask it.
     #[must_use]
     pub fn new(context: Arc<Context>, books: Arc<Books>) -> (Self, Handle) {
-        // Questions are answered within a pass; 1024 poses are what 100 robots send in a second.
-        let (sender, questions) = mpsc::channel(1024);
+        let (sender, questions) = mpsc::channel(QUESTIONS);
         let scheduler = Scheduler {
+            desk: Desk::new(Arc::clone(&context)),
             context,
             books,
             questions,
@@ -157,7 +174,14 @@ impl Scheduler {
                     None => watcher = self.rebuild().await,
                 },
                 // Cancel safe: a question that was not received stays in the channel.
-                Some(question) = self.questions.recv() => self.answer(question),
+                Some(question) = self.questions.recv() => {
+                    self.answer(question);
+                    // One pass serves everything that is there already, as with events.
+                    for _ in 0..QUESTIONS {
+                        let Ok(question) = self.questions.try_recv() else { break };
+                        self.answer(question);
+                    }
+                }
                 () = sleep_until(look_again) => {}
             }
         }
@@ -167,9 +191,10 @@ impl Scheduler {
     async fn rebuild(&mut self) -> Watcher {
         let watcher = watch_from_now(&self.context.store).await;
         self.cluster = Cluster::new();
+        self.desk.begin_anew();
         self.waiting.clear();
         self.own.clear();
-        for resource in [NODES, LEASES, TASKS] {
+        for resource in [QUOTAS, NODES, LEASES, TASKS] {
             for stored in self.context.store.list(resource, None).items {
                 self.take_in(resource, Change::Put, &stored);
             }
@@ -203,6 +228,8 @@ impl Scheduler {
             self.take_in_task(change, stored);
         } else if resource == NODES {
             self.take_in_node(change, stored);
+        } else if resource == QUOTAS {
+            self.take_in_quota(change, stored);
         } else if resource == LEASES && change == Change::Put {
             let Some(lease) = objects::read::<Lease>(stored) else { return };
             let Ok(node) = NodeName::new(lease.spec.node.clone()) else { return };
@@ -214,6 +241,19 @@ impl Scheduler {
                 status.holder.map(|h| h.uid),
             );
         }
+    }
+
+    fn take_in_quota(&mut self, change: Change, stored: &Arc<Stored>) {
+        let namespace = stored.key.namespace().unwrap_or_default();
+        let quota = (change == Change::Put).then(|| objects::read::<Quota>(stored)).flatten();
+        self.cluster.set_quota(namespace, quota.map(|q| q.spec));
+        self.desk.quotas_changed();
+    }
+
+    fn quota_reason(&self, demand: &Demand) -> Option<NodeRefusal> {
+        let accounts = self.cluster.has_quotas().then(|| Accounts::of(&self.cluster))?;
+        let over = schedule::over_quota(&self.cluster, &accounts, demand)?;
+        Some(schedule::quota_refusal(&over))
     }
 
     fn take_in_node(&mut self, change: Change, stored: &Arc<Stored>) {
@@ -289,14 +329,14 @@ impl Scheduler {
             Question::Plan { mut tasks, answer } => {
                 drop(answer.send(schedule::schedule(&mut self.cluster.clone(), &mut tasks)));
             }
-            Question::Why { uid, spec, answer } => {
-                let demand = Demand { uid, title: "".into(), spec, since: 0 };
+            Question::Why { demand, answer } => {
+                let quota = self.quota_reason(&demand);
                 let why = schedule::explain(&self.cluster, &demand);
-                drop(answer.send(
-                    why.iter().map(|(node, refusal)| refusal.of_node(node.as_str())).collect(),
-                ));
+                let nodes = why.iter().map(|(node, refusal)| refusal.of_node(node.as_str()));
+                drop(answer.send(quota.into_iter().chain(nodes).collect()));
             }
             Question::Pose { node, pose } => self.cluster.set_pose(&node, &pose),
+            Question::Desk(request) => self.desk.take(&mut self.cluster, request),
         }
     }
 
@@ -312,6 +352,8 @@ impl Scheduler {
             let waits = self.write_reasons(plan.waits).await;
             retry = [binds, waits].into_iter().flatten().min();
         }
+        let desk = self.desk.work(&mut self.cluster).await;
+        let retry = [retry, desk].into_iter().flatten().min();
         for node in std::mem::take(&mut self.dirty) {
             if let Some(member) = self.cluster.member(&node) {
                 self.books.put(&node, Page::from(&member.ledger));
@@ -383,55 +425,10 @@ impl Scheduler {
     /// The bind as one transaction. None: it does not wait any more.
     fn bind_ops(&self, bind: &Bind) -> Option<Vec<Op>> {
         let waiting = self.waiting.get(&bind.uid)?;
-        let now = MicroTime(self.context.clock.now());
-        let mut ops = Vec::with_capacity(2);
-        // A task that waits has nothing in its status but why it does; so the status is made anew, and
-        // the rest of the object is not read into types and back.
-        let status = TaskStatus {
-            phase: TaskPhase::Bound,
-            node: Some(bind.node.to_string()),
-            score: bind.score,
-            bound_at: Some(now.clone()),
-            lease: bind.leases.first().map(|(group, epoch)| TaskLease {
-                name: LeaseSpec::object_name(bind.node.as_str(), group),
-                epoch: *epoch,
-            }),
-            ..TaskStatus::default()
-        };
-        ops.push(Op::status(&waiting.stored, &status));
-        let key = &waiting.stored.key;
-        for (group, epoch) in &bind.leases {
-            let holder = LeaseHolder {
-                namespace: key.namespace().unwrap_or_default().to_owned(),
-                name: key.name.to_string(),
-                uid: bind.uid.clone(),
-            };
-            let status = LeaseStatus {
-                epoch: *epoch,
-                holder: Some(holder),
-                acquired: Some(now.clone()),
-                renewed: None,
-            };
-            ops.push(self.grant_op(bind.node.as_str(), group, status));
-        }
+        let now = self.context.clock.now();
+        let mut ops = vec![Op::status(&waiting.stored, &bind::status(bind, now))];
+        ops.extend(bind::grants(&self.context, bind, &waiting.stored.key, now));
         Some(ops)
-    }
-
-    fn grant_op(&self, node: &str, group: &str, status: LeaseStatus) -> Op {
-        let key: Key = objects::lease_key(node, group);
-        let present = self.context.store.get(&key);
-        if let Some((stored, mut lease)) =
-            present.and_then(|s| objects::read::<Lease>(&s).map(|l| (s, l)))
-        {
-            lease.status = Some(status);
-            return objects::replace(&stored, &lease);
-        }
-        let spec =
-            LeaseSpec { node: node.to_owned(), group: group.to_owned(), actuators: Vec::new() };
-        let mut lease = Lease::new(&key.name, spec);
-        objects::stamp_new(&mut lease.metadata, self.context.clock.now());
-        lease.status = Some(status);
-        objects::create(key, &lease)
     }
 
     /// Writes why tasks wait, where it is not written yet.

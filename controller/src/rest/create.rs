@@ -50,6 +50,37 @@ pub async fn create_object(
     commit(context, &new, prepared.object).await
 }
 
+/// A new object as a POST would store it, without storing it.
+///
+/// # Errors
+/// What a client would be told.
+pub(crate) fn prepare_object(
+    context: &Context,
+    resource: crate::store::Resource,
+    object: Value,
+) -> Result<Value, Failure> {
+    let entry = super::registry::of(resource)
+        .ok_or_else(|| Failure::internal(format!("{resource} is not served")))?;
+    let namespace = metadata::text(&object, "namespace").map(str::to_owned);
+    let new =
+        New { entry, namespace: namespace.as_deref(), mode: FieldValidation::Strict, dry: false };
+    prepare(context, &new, object).map(|prepared| prepared.object)
+}
+
+/// That a namespace is there and not ending, as a condition of a transaction.
+///
+/// # Errors
+/// What a client would be told when it is not.
+pub(crate) fn namespace_guard(
+    context: &Context,
+    resource: crate::store::Resource,
+    namespace: &str,
+) -> Result<Option<Op>, Failure> {
+    let entry = super::registry::of(resource)
+        .ok_or_else(|| Failure::internal(format!("{resource} is not served")))?;
+    namespace::admit_into(context, entry, Some(namespace), "")
+}
+
 /// What is asked for.
 struct New<'a> {
     entry: &'static Entry,

@@ -59,9 +59,22 @@ pub fn is_held(resource: Resource, object: &Value) -> bool {
 /// # Errors
 /// What a client would be told.
 pub async fn delete_object(context: &Context, key: &Key) -> Result<Arc<Stored>, Failure> {
+    delete_with_grace(context, key, None).await
+}
+
+/// As [`delete_object`], with the grace period that a client would name, seconds.
+///
+/// # Errors
+/// What a client would be told.
+pub(crate) async fn delete_with_grace(
+    context: &Context,
+    key: &Key,
+    grace_period_seconds: Option<i64>,
+) -> Result<Arc<Stored>, Failure> {
     let entry = super::registry::of(key.resource)
         .ok_or_else(|| Failure::internal(format!("{} is not served", key.resource)))?;
-    match end(context, entry, key, &Options::default()).await? {
+    let options = Options { grace_period_seconds, ..Options::default() };
+    match end(context, entry, key, &options).await? {
         Ended::Gone(stored) | Ended::Waiting(stored) => Ok(stored),
     }
 }

@@ -35,6 +35,14 @@ impl Failure {
         &self.message
     }
 
+    /// The causes by field: what is wrong with each.
+    #[must_use]
+    pub fn causes(&self) -> Vec<(String, String)> {
+        let causes = self.details["causes"].as_array().into_iter().flatten();
+        let text = |cause: &Value, key: &str| cause[key].as_str().unwrap_or_default().to_owned();
+        causes.map(|cause| (text(cause, "field"), text(cause, "message"))).collect()
+    }
+
     pub(crate) fn bad_request(message: impl Into<String>) -> Self {
         Self::new(StatusCode::BAD_REQUEST, "BadRequest", message)
     }

@@ -13,6 +13,7 @@
 //! | `selector` | label and field selectors |
 //! | [`namespace`] | the default namespace; ending of namespaces |
 //! | [`token`], `join` | join tokens; certificates for agents |
+//! | `offers` | what frameworks are offered, and why they are not |
 //! | `question` | plan, why, usage: answers that are no objects |
 //! | [`log`] | logs of tasks |
 //! | [`failure`] | every refusal as a `metav1.Status` |
@@ -28,6 +29,7 @@ mod list;
 pub mod log;
 mod metadata;
 pub mod namespace;
+mod offers;
 mod patch;
 pub mod path;
 mod query;
@@ -130,6 +132,7 @@ async fn dispatch(
         Target::Join => join::join(call).await,
         Target::Plan => question::plan(call).await,
         Target::Usage => question::usage(&call),
+        Target::Offers => offers::list(call.context).await,
         Target::Tokens(id) => token::answer(call, verb, id).await,
         Target::Objects(object) => objects(call, verb, object).await,
     }

@@ -122,6 +122,8 @@ pub(crate) enum Target {
     Plan,
     /// What nodes and tasks use now.
     Usage,
+    /// What frameworks are offered now.
+    Offers,
     /// Join tokens; one when it is named.
     Tokens(Option<String>),
     Objects(Object),
@@ -136,6 +138,7 @@ impl Target {
             Self::Join => Some("join"),
             Self::Plan => Some("plan"),
             Self::Usage => Some("usage"),
+            Self::Offers => Some("offers"),
             _ => None,
         }
     }
@@ -164,6 +167,7 @@ pub(crate) fn read(method: &Method, uri: &Uri) -> Result<(Verb, Target), Failure
             ["join"] => Target::Join,
             ["plan"] => Target::Plan,
             ["usage"] => Target::Usage,
+            ["offers"] => Target::Offers,
             ["jointokens"] => Target::Tokens(None),
             ["jointokens", id] => Target::Tokens(Some((*id).to_owned())),
             _ => Target::Objects(object(muster_api::GROUP, rest).ok_or_else(unknown)?),
@@ -229,7 +233,7 @@ fn object(group: &str, parts: &[&str]) -> Option<Object> {
         None => None,
         Some("status") if entry.info.has_status => Some(Subresource::Status),
         Some("log") if entry.has_log => Some(Subresource::Log),
-        Some("why") if entry.has_log => Some(Subresource::Why),
+        Some("why") if entry.has_why => Some(Subresource::Why),
         Some(_) => return None,
     };
     // An object of a namespaced kind has no path outside its namespace.

@@ -17,7 +17,7 @@ use super::{Answer, Call, body, registry};
 use crate::context::{Context, Live};
 use crate::objects;
 
-fn live(context: &Context) -> Result<&Live, Failure> {
+pub(super) fn live(context: &Context) -> Result<&Live, Failure> {
     context.live().ok_or_else(|| Failure::unavailable("the scheduler is not running"))
 }
 
@@ -54,6 +54,9 @@ pub(super) fn usage(call: &Call) -> Answer {
 
 /// GET …/tasks/NAME/why: every node's reason, not only those that fit into the status.
 pub(super) async fn why(call: Call, target: Object) -> Answer {
+    if target.entry.info.kind == "Framework" {
+        return super::offers::why(call.context, &target).await;
+    }
     let key = target.key()?;
     let stored =
         call.context.store.get(&key).ok_or_else(|| Failure::not_found(target.entry, &key.name))?;
@@ -62,7 +65,14 @@ pub(super) async fn why(call: Call, target: Object) -> Answer {
     let status = task.status.unwrap_or_default();
     let why = if status.phase == TaskPhase::Pending {
         let scheduler = live(&call.context)?.scheduler.clone();
-        scheduler.why(TaskUid::new(&*stored.uid), Arc::new(task.spec)).await.map_err(ended)?
+        let title = format!("{}/{}", key.namespace().unwrap_or_default(), key.name);
+        let demand = Demand {
+            uid: TaskUid::new(&*stored.uid),
+            title: title.into(),
+            spec: Arc::new(task.spec),
+            since: 0,
+        };
+        scheduler.why(demand).await.map_err(ended)?
     } else {
         Vec::new()
     };

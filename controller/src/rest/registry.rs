@@ -8,6 +8,8 @@ use super::path::Verb;
 use crate::store::{Key, Resource};
 
 const READ: &[Verb] = &[Verb::Get, Verb::List, Verb::Watch];
+const READ_AND_REMOVE: &[Verb] =
+    &[Verb::Delete, Verb::DeleteCollection, Verb::Get, Verb::List, Verb::Watch];
 const ALL: &[Verb] = &[
     Verb::Create,
     Verb::Delete,
@@ -38,6 +40,8 @@ pub(crate) struct Entry {
     pub(crate) verbs: &'static [Verb],
     pub(crate) categories: &'static [&'static str],
     pub(crate) has_log: bool,
+    /// `…/why` says why it waits.
+    pub(crate) has_why: bool,
     #[expect(dead_code, reason = "tables are rendered by clients so far")]
     pub(crate) columns: &'static [Column],
 }
@@ -69,10 +73,16 @@ fn entry(info: &'static KindInfo) -> Entry {
     Entry {
         info,
         resource: Resource::new(info.plural),
-        // A lease is given by the controller alone.
-        verbs: if info.kind == "Lease" { READ } else { ALL },
+        verbs: match info.kind {
+            // Given by the controller alone.
+            "Lease" => READ,
+            // Made when a framework subscribes.
+            "Framework" => READ_AND_REMOVE,
+            _ => ALL,
+        },
         categories: if info.group.is_empty() { &[] } else { &["muster"] },
         has_log: info.kind == "Task",
+        has_why: matches!(info.kind, "Task" | "Framework"),
         columns: &[],
     }
 }

@@ -253,6 +253,12 @@ impl Session {
                 }
                 Ok(())
             }
+            Some(FromAgent::Message(message)) => {
+                if let Some(live) = self.context.live() {
+                    live.frameworks.take_from_executor(&self.node, message);
+                }
+                Ok(())
+            }
             Some(FromAgent::Hello(_)) => Err(Status::invalid_argument("a second Hello").into()),
             None => Err(Status::invalid_argument("a message without a body").into()),
         }

@@ -13,10 +13,12 @@
 //! | [`board`] | assignments by node, kept up to date from the store |
 //! | [`nodes`] | what an agent says of its node → the Node object |
 //! | [`reports`] | what an agent says of a task → the Task object and its lease |
+//! | [`frameworks`] | the sessions of frameworks |
 //! | [`logs`] | logs, asked of the agent that has them |
 
 pub mod agents;
 pub mod board;
+pub mod frameworks;
 pub mod logs;
 pub mod nodes;
 pub mod reports;

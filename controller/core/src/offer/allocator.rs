@@ -25,7 +25,7 @@ pub struct Candidate {
 }
 
 /// Chooses what a framework is shown.
-pub trait Allocator: fmt::Debug + Send {
+pub trait Allocator: fmt::Debug + Send + Sync {
     /// The best robots and the best cloud nodes for `wish`, at most its limit of each, best first, robots before cloud
     /// nodes, without those that `refused` names. Every one passes [`refusal`].
     fn candidates(

@@ -1,0 +1,171 @@
+//! What the controller says to frameworks, as messages.
+
+use jiff::Timestamp;
+use muster_api::kind::node::NodeKind;
+use muster_api::kind::task::Task;
+use muster_api::phase::TaskPhase;
+use muster_api::validate::Violations;
+use muster_api::wire::framework::v1 as wire;
+use muster_api::wire::framework_session::{compute_to_wire, pose_to_wire, time_to_wire};
+use muster_controller_core::cluster::Member;
+use muster_controller_core::offer::allocator::actuators_free;
+use muster_controller_core::offer::settle::Denied;
+use muster_controller_core::offer::{Offer, Rescinded};
+
+/// An offer with what the node has now.
+pub(crate) fn offer(member: &Member, offer: &Offer, now: Timestamp) -> wire::Offer {
+    let facts = member.facts.as_ref();
+    let names = |functions: Option<Vec<String>>| functions.unwrap_or_default();
+    wire::Offer {
+        id: offer.id.to_string(),
+        node: member.name.to_string(),
+        kind: match facts.map(|f| f.kind) {
+            Some(NodeKind::Robot) => wire::NodeKind::Robot,
+            Some(NodeKind::Cloud) => wire::NodeKind::Cloud,
+            None => wire::NodeKind::Unspecified,
+        }
+        .into(),
+        labels: facts.map(|f| f.labels.clone().into_iter().collect()).unwrap_or_default(),
+        score: offer.score,
+        pose: facts.and_then(|f| f.pose.as_ref()).map(pose_to_wire),
+        free: Some(compute_to_wire(&member.ledger.free())),
+        sensors: names(facts.map(|f| f.sensors.iter().map(ToString::to_string).collect())),
+        actuators: names(
+            facts
+                .filter(|_| actuators_free(member))
+                .map(|f| f.actuators.iter().map(ToString::to_string).collect()),
+        ),
+        runtimes: names(
+            facts.map(|f| {
+                f.runtimes.iter().filter(|r| r.available).map(|r| r.name.clone()).collect()
+            }),
+        ),
+        executors: Vec::new(),
+        made_at: Some(time_to_wire(now)),
+    }
+}
+
+/// Why an offer ended.
+pub(crate) fn rescinded(why: Rescinded) -> wire::RescindReason {
+    match why {
+        Rescinded::Changed => wire::RescindReason::Changed,
+        Rescinded::Taken => wire::RescindReason::Taken,
+        Rescinded::OutOfRange => wire::RescindReason::OutOfRange,
+        Rescinded::Filtered => wire::RescindReason::Filtered,
+        Rescinded::NodeLost => wire::RescindReason::NodeLost,
+        Rescinded::Expired => wire::RescindReason::Expired,
+        Rescinded::Suppressed => wire::RescindReason::Suppressed,
+        Rescinded::Closer => wire::RescindReason::Closer,
+        Rescinded::Quota => wire::RescindReason::Quota,
+    }
+}
+
+fn refusal(
+    reason: wire::RefusalReason,
+    message: String,
+    causes: Vec<wire::Cause>,
+) -> wire::Refusal {
+    wire::Refusal { reason: reason.into(), message, causes }
+}
+
+/// Why an Accept gets nothing.
+pub(crate) fn denied(denied: &Denied) -> wire::Refusal {
+    use wire::RefusalReason as Reason;
+    let cause = |launch: usize, message: String| {
+        vec![wire::Cause { field: format!("launches[{launch}]"), message }]
+    };
+    match denied {
+        Denied::OffersGone { offers } => {
+            let list: Vec<String> = offers.iter().map(ToString::to_string).collect();
+            refusal(
+                Reason::OfferGone,
+                format!("not offered (any more): {}", list.join(", ")),
+                Vec::new(),
+            )
+        }
+        Denied::NotNamed { launch } => refusal(
+            Reason::Invalid,
+            format!("launch {launch} uses an offer that the call does not accept"),
+            cause(*launch, "name the offer in accept.offers, too".to_owned()),
+        ),
+        Denied::Refused { launch, node, refusal: why } => {
+            let message = format!("{node} {why}");
+            refusal(Reason::Conflict, message.clone(), cause(*launch, message))
+        }
+        Denied::Quota { launch, over } => {
+            refusal(Reason::Quota, over.to_string(), cause(*launch, over.to_string()))
+        }
+    }
+}
+
+/// A call that means nothing.
+pub(crate) fn invalid(causes: Vec<wire::Cause>) -> wire::Refusal {
+    let message =
+        causes.iter().map(|c| format!("{}: {}", c.field, c.message)).collect::<Vec<_>>().join("; ");
+    refusal(wire::RefusalReason::Invalid, message, causes)
+}
+
+/// Violations under a prefix, as causes.
+pub(crate) fn causes(prefix: &str, violations: &Violations) -> Vec<wire::Cause> {
+    let cause = |v: &muster_api::validate::Violation| wire::Cause {
+        field: format!("{prefix}{}", v.path),
+        message: match &v.suggestion {
+            Some(suggestion) => format!("{}; {suggestion}", v.reason),
+            None => v.reason.clone(),
+        },
+    };
+    violations.iter().map(cause).collect()
+}
+
+/// Nothing is wrong with the call, and it could not be done.
+pub(crate) fn unavailable() -> wire::Refusal {
+    refusal(
+        wire::RefusalReason::Unavailable,
+        "the controller could not write it; try again".to_owned(),
+        Vec::new(),
+    )
+}
+
+/// There is no such thing.
+pub(crate) fn not_found(what: String) -> wire::Refusal {
+    refusal(wire::RefusalReason::NotFound, what, Vec::new())
+}
+
+/// The present state of a task.
+pub(crate) fn update(task: &Task, version: u64) -> wire::Update {
+    let status = task.status.clone().unwrap_or_default();
+    let state = match status.phase {
+        TaskPhase::Pending => wire::TaskState::Pending,
+        TaskPhase::Bound => wire::TaskState::Bound,
+        TaskPhase::Starting => wire::TaskState::Starting,
+        TaskPhase::Running => wire::TaskState::Running,
+        TaskPhase::Stopping => wire::TaskState::Stopping,
+        TaskPhase::Succeeded => wire::TaskState::Succeeded,
+        TaskPhase::Failed => wire::TaskState::Failed,
+        TaskPhase::Unknown => wire::TaskState::Unknown,
+    };
+    wire::Update {
+        task: task.metadata.uid.clone().unwrap_or_default(),
+        name: task.metadata.name.clone().unwrap_or_default(),
+        node: status.node.unwrap_or_default(),
+        state: state.into(),
+        reason: status.reason,
+        message: status.message,
+        exit_code: status.exit_code,
+        attempt: status.attempt,
+        version,
+        started_at: status.started_at.map(|t| time_to_wire(t.0)),
+        finished_at: status.finished_at.map(|t| time_to_wire(t.0)),
+    }
+}
+
+/// What is said of a task that there is not.
+pub(crate) fn gone(uid: &str) -> wire::Update {
+    wire::Update {
+        task: uid.to_owned(),
+        state: wire::TaskState::Gone.into(),
+        reason: "Gone".to_owned(),
+        message: "the framework has no such task".to_owned(),
+        ..wire::Update::default()
+    }
+}

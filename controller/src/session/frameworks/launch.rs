@@ -1,0 +1,121 @@
+//! The launches of an Accept → Task objects that only need their node.
+
+use muster_api::id::TaskUid;
+use muster_api::kind::framework::{ACKNOWLEDGE_FINALIZER, FRAMEWORK_LABEL};
+use muster_api::kind::task::Task;
+use muster_api::wire::framework::v1 as wire;
+use muster_api::wire::framework_session::json_of;
+use muster_controller_core::offer::OfferId;
+use serde_json::{Value, json};
+
+use super::{convert, subscribe};
+use crate::context::Context;
+use crate::objects::TASKS;
+use crate::reconcile::desk::{FrameworkUid, Prepared};
+use crate::rest::create;
+use crate::store::{Key, Op};
+
+/// Checks everything that can be checked without the ledger; all that is wrong is said at once.
+pub(super) fn prepare(
+    context: &Context,
+    (framework, uid): (&Key, &FrameworkUid),
+    accept: &wire::Accept,
+) -> Result<(Vec<Prepared>, Option<Op>), wire::Refusal> {
+    let namespace = framework.namespace().unwrap_or_default();
+    let guard = match create::namespace_guard(context, TASKS, namespace) {
+        Ok(guard) => guard,
+        Err(failure) => {
+            return Err(convert::invalid(vec![wire::Cause {
+                field: "launches".to_owned(),
+                message: failure.message().to_owned(),
+            }]));
+        }
+    };
+    let (mut prepared, mut causes) = (Vec::new(), Vec::new());
+    for (i, launch) in accept.launches.iter().enumerate() {
+        let offer = match (launch.offer.as_str(), accept.offers.as_slice()) {
+            ("", [only]) => parse(only),
+            (named, _) => parse(named),
+        };
+        let Some(offer) = offer else {
+            causes.push(wire::Cause {
+                field: format!("launches[{i}].offer"),
+                message: "names none of the offers that the call accepts".to_owned(),
+            });
+            continue;
+        };
+        match task_of(context, (framework, uid), launch) {
+            Ok((object, task)) => prepared.push(Prepared {
+                key: Key::namespaced(
+                    TASKS,
+                    namespace,
+                    task.metadata.name.as_deref().unwrap_or_default(),
+                ),
+                uid: TaskUid::new(task.metadata.uid.clone().unwrap_or_default()),
+                object,
+                spec: task.spec,
+                offer,
+            }),
+            Err(wrong) => causes.extend(wrong.into_iter().map(|cause| wire::Cause {
+                field: format!("launches[{i}].{}", cause.field),
+                message: cause.message,
+            })),
+        }
+    }
+    if causes.is_empty() { Ok((prepared, guard)) } else { Err(convert::invalid(causes)) }
+}
+
+/// The number in an offer's id.
+pub(super) fn parse(id: &str) -> Option<OfferId> {
+    id.parse().ok().map(OfferId)
+}
+
+fn task_of(
+    context: &Context,
+    (framework, uid): (&Key, &FrameworkUid),
+    launch: &wire::Launch,
+) -> Result<(Value, Task), Vec<wire::Cause>> {
+    let spec = launch.spec.as_ref().map(json_of).unwrap_or_default();
+    let mut labels: serde_json::Map<String, Value> =
+        launch.labels.iter().map(|(k, v)| (k.clone(), v.as_str().into())).collect();
+    labels.insert(FRAMEWORK_LABEL.to_owned(), (&*framework.name).into());
+    let mut metadata = json!({
+        "namespace": framework.namespace(),
+        "labels": labels,
+        "annotations": launch.annotations,
+        "ownerReferences": [subscribe::owner(framework, uid)],
+        "finalizers": [ACKNOWLEDGE_FINALIZER],
+    });
+    if launch.name.is_empty() {
+        metadata["generateName"] = format!("{}-", framework.name).into();
+    } else {
+        metadata["name"] = launch.name.as_str().into();
+    }
+    let object = json!({
+        "apiVersion": muster_api::API_VERSION, "kind": "Task", "metadata": metadata, "spec": spec,
+    });
+    let wrong =
+        |field: &str, message: String| vec![wire::Cause { field: field.to_owned(), message }];
+    let object = create::prepare_object(context, TASKS, object).map_err(|failure| {
+        let causes = failure.causes();
+        if causes.is_empty() {
+            return wrong("spec", failure.message().to_owned());
+        }
+        causes
+            .into_iter()
+            .map(|(field, message)| wire::Cause {
+                field: field.strip_prefix("metadata.").unwrap_or(&field).to_owned(),
+                message,
+            })
+            .collect()
+    })?;
+    let task: Task =
+        serde_json::from_value(object.clone()).map_err(|error| wrong("spec", error.to_string()))?;
+    if task.spec.placement.node.is_some() {
+        return Err(wrong(
+            "spec.placement.node",
+            "is set by the offer that the launch uses; leave it out".to_owned(),
+        ));
+    }
+    Ok((object, task))
+}

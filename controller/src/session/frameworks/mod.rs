@@ -1,0 +1,270 @@
+//! The sessions of frameworks (two-level scheduling; Avalon, III-A and IV-B).
+//!
+//! ```text
+//!   gRPC stream ┐                        ┌── Request ──▶ reconcile::desk (offers, Accepts)
+//!   JSON lines ─┴─▶ session (one a task) ┤◀── events ────┘
+//!                        ▲   ▲           └── Framework and Task objects: store
+//!             mailbox of updates   messages of executors
+//! ```
+//!
+//! | module | is |
+//! |---|---|
+//! | [`session`] | one framework's session, whatever carries it |
+//! | [`subscribe`] | the first call: who it is, and its Framework object |
+//! | [`launch`] | the launches of an Accept → checked Task objects |
+//! | [`updates`] | states of tasks → the mailboxes of their frameworks |
+//! | [`service`], [`lines`] | the two transports |
+//! | [`convert`] | what is said, as messages |
+
+pub(crate) mod convert;
+mod launch;
+pub mod lines;
+pub mod service;
+mod session;
+mod subscribe;
+pub mod updates;
+
+pub(crate) use session::let_go;
+pub(crate) use subscribe::{owner_of, write_away};
+
+use std::collections::{BTreeMap, HashMap};
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex};
+use std::time::Duration;
+
+use muster_api::kind::task::Task;
+use muster_api::name::NodeName;
+use muster_api::wire::agent::v1::controller_message::Body as ToAgent;
+use muster_api::wire::agent::v1::{ControllerMessage, Message as AgentMessage};
+use muster_api::wire::framework::v1 as wire;
+use tokio::sync::{Notify, mpsc, oneshot};
+use tokio_util::sync::CancellationToken;
+use tokio_util::task::TaskTracker;
+
+use super::lock;
+use crate::context::Context;
+use crate::objects;
+use crate::reconcile::desk::{FrameworkUid, Outlet, Request, View};
+use crate::reconcile::schedule;
+
+/// The generated server side of the session.
+#[allow(clippy::all, clippy::allow_attributes, unreachable_pub, reason = "generated")]
+pub(crate) mod proto {
+    include!(concat!(env!("OUT_DIR"), "/muster.framework.v1.rs"));
+}
+
+/// How often a silent session says that it is alive.
+pub const HEARTBEAT_EVERY: Duration = Duration::from_secs(5);
+/// What may wait to be sent to one framework: some rounds of offers of a large one. Past it the framework is cut off.
+const EVENTS: usize = 1024;
+/// Calls that wait for their turn in one session.
+const CALLS: usize = 64;
+/// Largest message between a framework and an executor.
+pub const MAX_MESSAGE: usize = 4 << 20;
+/// Largest message on the wire: a [`MAX_MESSAGE`] with what is around it.
+pub const MAX_WIRE: usize = MAX_MESSAGE + (64 << 10);
+
+/// The newest state of each task that its framework has yet to hear of.
+#[derive(Debug, Default)]
+pub(crate) struct Mailbox {
+    updates: Mutex<BTreeMap<String, wire::Update>>,
+    wake: Notify,
+}
+
+impl Mailbox {
+    pub(crate) fn put(&self, update: wire::Update) {
+        let mut updates = lock(&self.updates);
+        match updates.get(&update.task) {
+            Some(newer) if newer.version >= update.version => return,
+            _ => drop(updates.insert(update.task.clone(), update)),
+        }
+        self.wake.notify_one();
+    }
+
+    fn take(&self) -> BTreeMap<String, wire::Update> {
+        std::mem::take(&mut *lock(&self.updates))
+    }
+}
+
+/// An open session.
+#[derive(Debug, Clone)]
+struct Open {
+    outlet: Outlet,
+    mailbox: Arc<Mailbox>,
+    /// For calls that come over HTTP.
+    calls: mpsc::Sender<wire::Call>,
+    /// Ends it.
+    cut: CancellationToken,
+}
+
+/// Every framework's session.
+#[derive(Debug)]
+pub struct Frameworks {
+    context: Arc<Context>,
+    scheduler: schedule::Handle,
+    agents: Arc<super::Sessions>,
+    tasks: TaskTracker,
+    open: Mutex<HashMap<FrameworkUid, Open>>,
+    /// Sessions by the id that their frameworks were told.
+    by_session: Mutex<HashMap<String, FrameworkUid>>,
+    next_session: AtomicU64,
+    /// Tasks that spoke as executors, and the frameworks that they belong to.
+    executors: Mutex<HashMap<String, FrameworkUid>>,
+}
+
+impl Frameworks {
+    /// Nobody is connected. Sessions run on `tasks` and end with `context.stop`.
+    #[must_use]
+    pub fn new(
+        context: Arc<Context>,
+        scheduler: schedule::Handle,
+        agents: Arc<super::Sessions>,
+        tasks: TaskTracker,
+    ) -> Self {
+        Frameworks {
+            context,
+            scheduler,
+            agents,
+            tasks,
+            open: Mutex::default(),
+            by_session: Mutex::default(),
+            next_session: AtomicU64::new(1),
+            executors: Mutex::default(),
+        }
+    }
+
+    fn session_number(&self) -> u64 {
+        self.next_session.fetch_add(1, Ordering::Relaxed)
+    }
+
+    /// Whether the framework has a session.
+    #[must_use]
+    pub fn is_connected(&self, uid: &str) -> bool {
+        lock(&self.open).contains_key(uid)
+    }
+
+    /// Takes a session in; an earlier one of the same framework ends.
+    fn connect(&self, uid: &FrameworkUid, session_id: &str, open: Open) {
+        lock(&self.by_session).insert(session_id.to_owned(), Arc::clone(uid));
+        if let Some(earlier) = lock(&self.open).insert(Arc::clone(uid), open) {
+            earlier.cut.cancel();
+        }
+    }
+
+    /// A session has ended. True: the framework has no other.
+    fn disconnect(&self, uid: &FrameworkUid, session_id: &str, number: u64) -> bool {
+        lock(&self.by_session).remove(session_id);
+        let mut open = lock(&self.open);
+        let is_it = open.get(uid).is_some_and(|o| o.outlet.session() == number);
+        if is_it {
+            open.remove(uid);
+        }
+        is_it
+    }
+
+    /// Ends a framework's session.
+    pub fn cut(&self, uid: &str) {
+        if let Some(open) = lock(&self.open).get(uid) {
+            open.cut.cancel();
+        }
+    }
+
+    pub(crate) fn put_update(&self, uid: &str, update: wire::Update) {
+        if let Some(open) = lock(&self.open).get(uid) {
+            open.mailbox.put(update);
+        }
+    }
+
+    /// Tells a framework something. Lost when it is away.
+    pub(crate) fn say(&self, uid: &str, event: wire::event::Event) {
+        if let Some(open) = lock(&self.open).get(uid) {
+            open.outlet.say(event);
+        }
+    }
+
+    /// Tells every framework something.
+    pub(crate) fn say_to_all(&self, event: &wire::event::Event) {
+        for open in lock(&self.open).values() {
+            open.outlet.say(event.clone());
+        }
+    }
+
+    /// What every framework is offered now.
+    pub(crate) async fn look(&self) -> Vec<View> {
+        let (answer, answered) = oneshot::channel();
+        match self.scheduler.desk(Request::Look { answer }).await {
+            Ok(()) => answered.await.unwrap_or_default(),
+            // The controller ends.
+            Err(_) => Vec::new(),
+        }
+    }
+
+    /// Forgets a framework whose object is gone.
+    pub(crate) async fn remove(&self, uid: &str) {
+        // The desk ends only with the controller.
+        let _ = self.scheduler.desk(Request::Remove { uid: uid.into() }).await;
+        lock(&self.executors).retain(|_, owner| **owner != *uid);
+    }
+
+    /// From an executor of a node's agent to its framework. At most once: lost when the framework is away.
+    pub(crate) fn take_from_executor(&self, node: &NodeName, message: AgentMessage) {
+        let owner = self.owner_of_executor(node, &message.executor);
+        let Some(owner) = owner else {
+            tracing::warn!(%node, executor = message.executor, "a message of no framework's executor is dropped");
+            return;
+        };
+        let AgentMessage { executor, data } = message;
+        let message = wire::Message { executor, node: node.to_string(), data };
+        self.say(&owner, wire::event::Event::Message(message));
+    }
+
+    /// The framework of a task on this node; remembered, so that a stream of messages reads no objects.
+    fn owner_of_executor(&self, node: &NodeName, uid: &str) -> Option<FrameworkUid> {
+        let (placed_on, key) = self.agents.board().find(uid)?;
+        if placed_on != *node {
+            return None;
+        }
+        if let Some(owner) = lock(&self.executors).get(uid) {
+            return Some(Arc::clone(owner));
+        }
+        let task: Task = objects::read(&*self.context.store.get(&key)?)?;
+        let owner = owner_of(&task.metadata)?;
+        lock(&self.executors).insert(uid.to_owned(), Arc::clone(&owner));
+        Some(owner)
+    }
+
+    /// To an executor. At most once: lost when its node is away.
+    fn send_to_executor(
+        &self,
+        framework: &str,
+        message: wire::Message,
+    ) -> Result<(), &'static str> {
+        let uid = &message.executor;
+        let (node, _) = self.agents.board().find(uid).ok_or("there is no such executor")?;
+        let owner = self.owner_of_executor(&node, uid);
+        if owner.is_none_or(|owner| *owner != *framework) {
+            return Err("the executor is another framework's");
+        }
+        let connection = self.agents.connection(&node).ok_or("its node is not connected")?;
+        let body =
+            ToAgent::Message(AgentMessage { executor: message.executor, data: message.data });
+        let message = ControllerMessage { body: Some(body) };
+        connection
+            .outbound
+            .try_send(message)
+            .map_err(|_| "its node does not keep up with what it is sent")
+    }
+
+    pub(crate) fn is_executor(&self, uid: &str) -> bool {
+        lock(&self.executors).contains_key(uid)
+    }
+
+    pub(crate) fn forget_executor(&self, uid: &str) {
+        lock(&self.executors).remove(uid);
+    }
+
+    fn calls_of(&self, session_id: &str) -> Option<mpsc::Sender<wire::Call>> {
+        let uid = lock(&self.by_session).get(session_id).cloned()?;
+        lock(&self.open).get(&uid).map(|o| o.calls.clone())
+    }
+}
