@@ -234,6 +234,12 @@ impl Session<'_> {
 
     async fn hear(&mut self, body: Hear) {
         match body {
+            Hear::Message(message) => {
+                tracing::warn!(
+                    executor = message.executor,
+                    "a message for no executor of this node is dropped"
+                );
+            }
             Hear::Welcome(_) => tracing::warn!("a second welcome"),
             Hear::Assignments(assignments) => {
                 // Closed: the agent is going down, and this session with it.

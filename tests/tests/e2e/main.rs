@@ -3,6 +3,7 @@
 mod cli;
 mod demo;
 mod figure4;
+mod frameworks;
 mod lease;
 mod quotas;
 mod survival;
