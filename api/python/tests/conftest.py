@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import contextlib
+
 import pytest
 
 import muster
@@ -35,8 +37,6 @@ def start(controller):
     yield start
     for driver in drivers:
         driver.abort()
-        try:
+        with contextlib.suppress(Exception):  # The test that provoked it has looked at it.
             driver.join(PATIENCE)
-        except Exception:
-            pass  # The test that provoked it has looked at it.
         assert driver.state in (muster.DriverState.STOPPED, muster.DriverState.ABORTED)

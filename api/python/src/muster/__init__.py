@@ -4,6 +4,8 @@ A framework subscribes with a ``SchedulerDriver``, is offered the robots and clo
 its tasks on them. The names are those of the Avalon paper's Table I and of Mesos.
 """
 
+from concurrent.futures import Future
+
 from muster._calls import Result
 from muster._life import DriverState
 from muster.driver import SchedulerDriver
@@ -19,8 +21,8 @@ from muster.errors import (
     RefusalReason,
     WireError,
 )
-from muster.executors import Executor, ExecutorInfo, ExecutorTask, ExecutorTaskState, Lease
 from muster.executor_driver import ExecutorDriver
+from muster.executors import Executor, ExecutorInfo, ExecutorTask, ExecutorTaskState, Lease
 from muster.model import (
     Compute,
     Cost,
@@ -39,6 +41,9 @@ from muster.model import (
 from muster.position import ClickedPoint, PositionSource, position_from_clicked_point
 from muster.scheduler import Scheduler
 from muster.task import TaskInfo, container, executor, process
+
+#: What ``launch_tasks`` gives its done-callbacks, for annotations.
+Launching = Future[LaunchResult]
 
 __all__ = [
     "CallRefused",
@@ -60,6 +65,7 @@ __all__ = [
     "FrameworkInfo",
     "LaunchResult",
     "Launched",
+    "Launching",
     "Lease",
     "MusterError",
     "NodeKind",

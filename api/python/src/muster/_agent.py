@@ -62,8 +62,11 @@ class Outbox:
             if update.task not in self._tasks:
                 return False
             update.sequence = next(self._sequence)
+            # Behind the others in both, so that what is said has growing sequences.
             self._unacknowledged[update.task] = update
+            self._unacknowledged.move_to_end(update.task)
             self._unsent[update.task] = None
+            self._unsent.move_to_end(update.task)
             if ends:
                 self._tasks.discard(update.task)
             self._changed.notify_all()

@@ -7,6 +7,7 @@ one. The others (launches, declines, messages) mean something in their session o
 from __future__ import annotations
 
 import itertools
+import logging
 import threading
 from collections import OrderedDict, deque
 from collections.abc import Iterator
@@ -19,6 +20,8 @@ from muster._pb import framework as pb
 from muster.errors import Disconnected, DriverNotRunning, MusterError, Overloaded
 
 T = TypeVar("T")
+
+log = logging.getLogger("muster")
 
 MOST_CALLS = 4096
 MOST_BYTES = 64 * 1024 * 1024
@@ -128,7 +131,9 @@ class Calls:
         if waiting is None:
             return
         if answer.HasField("refusal"):
-            waiting.result.set_exception(_wire.refusal(answer.refusal))
+            refused = _wire.refusal(answer.refusal)
+            log.info("%s is refused: %s", waiting.call.WhichOneof("call"), refused)
+            waiting.result.set_exception(refused)
         else:
             waiting.result.set_result(waiting.read(answer))
 

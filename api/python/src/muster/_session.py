@@ -145,13 +145,15 @@ class Session:
                 else:
                     self._event(event)
             raise Disconnected("the controller ended the session")
+        except Disconnected:
+            if subscribed:
+                books.inbox.put(inbox.Lost())
+            raise
         finally:
             with self._lock:
                 self._stream = None
             stream.close()
             books.calls.lost()
-            if subscribed:
-                books.inbox.put(inbox.Lost())
 
     def _subscribed(self, event: pb.Event, stream: Stream) -> None:
         kind = event.WhichOneof("event")
