@@ -198,9 +198,8 @@ def test_an_update_is_delivered_once_and_acknowledged_as_often_as_it_comes(contr
     (update,) = scheduler.heard.expect("status_update")
     assert (update.task_id, update.state, update.exit_code) == ("t-1", muster.TaskState.RUNNING, None)
     assert session.expect("acknowledge") == pb.Acknowledge(task="t-1", version=3)
-    session.send(update=an_update(3))
-    session.send(update=an_update(2))
-    for _ in range(2):
+    for version in (3, 2):
+        session.send(update=an_update(version))
         session.expect("acknowledge")
     session.send(update=an_update(4, "FAILED"))
     (update,) = scheduler.heard.expect("status_update")
