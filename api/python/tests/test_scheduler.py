@@ -329,6 +329,27 @@ def test_a_framework_that_was_forgotten_begins_anew(controller, start):
     assert driver.framework_id == "f-2"
 
 
+@pytest.mark.parametrize(("reason", "next_id"), [("Unavailable", "f-0"), ("Ending", "f-0"), ("UnknownFramework", "")])
+def test_a_subscribe_is_said_again_where_that_is_of_use(controller, start, reason, next_id):
+    _, scheduler = start(info=muster.FrameworkInfo(name="deliver", framework_id="f-0"))
+    session = controller.accept()
+    session.expect("subscribe")
+    session.send(error=pb.Error(reason=reason, message="no"))
+    session.end()
+    again = controller.accept()
+    assert again.subscribed("f-2").framework_id == next_id
+    assert scheduler.heard.expect("registered") == ("f-2",)
+
+
+def test_a_subscribe_that_stays_refused_is_an_error(controller, start):
+    driver, scheduler = start()
+    session = controller.accept()
+    session.expect("subscribe")
+    session.send(error=pb.Error(reason="AlreadyExists", message="no"))
+    assert scheduler.heard.expect("error") == ("AlreadyExists", "no")
+    assert driver.join(PATIENCE) is muster.DriverState.ABORTED
+
+
 def test_stop_tears_the_framework_down(controller, start, tmp_path):
     state = tmp_path / "state"
     driver, scheduler, session = registered(controller, start, state_file=state)
