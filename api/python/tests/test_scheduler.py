@@ -198,9 +198,8 @@ def test_an_update_is_delivered_once_and_acknowledged_as_often_as_it_comes(contr
     (update,) = scheduler.heard.expect("status_update")
     assert (update.task_id, update.state, update.exit_code) == ("t-1", muster.TaskState.RUNNING, None)
     assert session.expect("acknowledge") == pb.Acknowledge(task="t-1", version=3)
-    session.send(update=an_update(3))
-    session.send(update=an_update(2))
-    for _ in range(2):
+    for version in (3, 2):
+        session.send(update=an_update(version))
         session.expect("acknowledge")
     session.send(update=an_update(4, "FAILED"))
     (update,) = scheduler.heard.expect("status_update")
@@ -328,6 +327,27 @@ def test_a_framework_that_was_forgotten_begins_anew(controller, start):
     again.subscribed("f-2", reregistered=False)
     assert scheduler.heard.expect("registered") == ("f-2",)
     assert driver.framework_id == "f-2"
+
+
+@pytest.mark.parametrize(("reason", "next_id"), [("Unavailable", "f-0"), ("Ending", "f-0"), ("UnknownFramework", "")])
+def test_a_subscribe_is_said_again_where_that_is_of_use(controller, start, reason, next_id):
+    _, scheduler = start(info=muster.FrameworkInfo(name="deliver", framework_id="f-0"))
+    session = controller.accept()
+    session.expect("subscribe")
+    session.send(error=pb.Error(reason=reason, message="no"))
+    session.end()
+    again = controller.accept()
+    assert again.subscribed("f-2").framework_id == next_id
+    assert scheduler.heard.expect("registered") == ("f-2",)
+
+
+def test_a_subscribe_that_stays_refused_is_an_error(controller, start):
+    driver, scheduler = start()
+    session = controller.accept()
+    session.expect("subscribe")
+    session.send(error=pb.Error(reason="AlreadyExists", message="no"))
+    assert scheduler.heard.expect("error") == ("AlreadyExists", "no")
+    assert driver.join(PATIENCE) is muster.DriverState.ABORTED
 
 
 def test_stop_tears_the_framework_down(controller, start, tmp_path):

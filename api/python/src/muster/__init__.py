@@ -6,6 +6,7 @@ its tasks on them. The names are those of the Avalon paper's Table I and of Meso
 
 from concurrent.futures import Future
 
+from muster import program
 from muster._calls import Result
 from muster._life import DriverState
 from muster.driver import SchedulerDriver
@@ -87,4 +88,5 @@ __all__ = [
     "executor",
     "position_from_clicked_point",
     "process",
+    "program",
 ]

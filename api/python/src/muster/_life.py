@@ -18,6 +18,9 @@ STOP_SECONDS = 10.0
 #: Of one message between a framework and an executor.
 MOST_MESSAGE_BYTES = 4 * 1024 * 1024
 
+#: A signal that one of gRPC's threads gets does not wake the main thread, whose matter it is.
+_LONGEST_WAIT = 0.5
+
 
 class DriverState(enum.Enum):
     NOT_STARTED = 1
@@ -35,6 +38,8 @@ class Life:
         self._state = DriverState.NOT_STARTED
         self._failure: Optional[BaseException] = None
         self._threads: list[threading.Thread] = []
+        # Counted here: Thread.join, once a KeyboardInterrupt has come out of it, takes the thread for dead (bpo-45274).
+        self._alive = 0
 
     @property
     def state(self) -> DriverState:
@@ -52,10 +57,12 @@ class Life:
         if threading.current_thread() in self._threads:
             raise RuntimeError("a callback cannot wait for the end of its own driver")
         deadline = None if timeout is None else time.monotonic() + timeout
-        for thread in self._threads:
-            thread.join(None if deadline is None else max(0.0, deadline - time.monotonic()))
-            if thread.is_alive():
-                return self.state
+        with self._changed:
+            while self._alive:
+                left = _LONGEST_WAIT if deadline is None else deadline - time.monotonic()
+                if left <= 0:
+                    return self._state
+                self._changed.wait(min(left, _LONGEST_WAIT))
         if self._failure is not None:
             raise self._failure
         return self.state
@@ -70,9 +77,21 @@ class Life:
         with self._changed:
             self._must_be_new()
             self._state = DriverState.RUNNING
-            self._threads = [threading.Thread(target=body, name=name, daemon=True) for name, body in bodies.items()]
+            self._threads = [
+                threading.Thread(target=self._counted, args=(body,), name=name, daemon=True)
+                for name, body in bodies.items()
+            ]
+            self._alive = len(self._threads)
             for thread in self._threads:
                 thread.start()
+
+    def _counted(self, body: Callable[[], None]) -> None:
+        try:
+            body()
+        finally:
+            with self._changed:
+                self._alive -= 1
+                self._changed.notify_all()
 
     def _must_be_new(self) -> None:
         with self._changed:

@@ -22,7 +22,7 @@ from muster._pb import framework as pb
 from muster._seen import Seen, Verdict
 from muster._state_file import StateFile
 from muster._stream import Stream
-from muster.errors import ConfigError, Disconnected, FrameworkError, WireError
+from muster.errors import ConfigError, Disconnected, FrameworkError, MusterError, WireError
 from muster.kubeconfig import Target
 from muster.model import FrameworkInfo, Offer
 
@@ -33,6 +33,9 @@ CONNECT_SECONDS = 20.0
 #: A session without any event for so many heartbeat intervals is dead, as Mesos' clients count it.
 MISSED_HEARTBEATS = 5
 DEFAULT_HEARTBEAT_SECONDS = 15.0
+#: Refusals of a Subscribe that a later one does not meet: the store is busy, an older framework of the name is ending.
+_PASSING = ("Unavailable", "Ending")
+_FORGOTTEN = "UnknownFramework"
 
 
 @dataclass
@@ -158,7 +161,7 @@ class Session:
     def _subscribed(self, event: pb.Event, stream: Stream) -> None:
         kind = event.WhichOneof("event")
         if kind == "error":
-            raise FrameworkError(event.error.reason, event.error.message)
+            raise self._refused(event.error)
         if kind != "subscribed" or not event.subscribed.framework_id:
             raise Disconnected(f"the session began with {kind}")
         answer = event.subscribed
@@ -176,6 +179,18 @@ class Session:
             self._books.seen.forget()
             self._books.inbox.put(inbox.Registered(answer.framework_id))
         self._books.calls.ready()
+
+    def _refused(self, error: pb.Error) -> MusterError:
+        """Of a Subscribe: whether to say it again."""
+        why = FrameworkError(error.reason, error.message)
+        if error.reason in _PASSING:
+            return Disconnected(str(why))
+        if error.reason == _FORGOTTEN and self._books.info.framework_id and not self._ending():
+            # Away for longer than its failover timeout: its tasks are gone, and the work is still wanted.
+            log.warning("the framework begins anew: %s", why)
+            self._books.change(lambda info: replace(info, framework_id=""))
+            return Disconnected(str(why))
+        return why
 
     def _event(self, event: pb.Event) -> None:
         kind = event.WhichOneof("event")

@@ -8,12 +8,16 @@ import math
 import signal
 import sys
 
+from muster._life import DriverState
 from muster.driver import SchedulerDriver
 from muster.errors import MusterError
 from muster.model import Position
 
 #: What a shell gives a program that an interrupt ended.
 INTERRUPTED = 130
+_ENDING = (signal.SIGINT, signal.SIGTERM)
+#: How soon a signal is looked at.
+_SIGNAL_SECONDS = 0.2
 
 
 def position(text: str) -> Position:
@@ -37,22 +41,28 @@ def add_arguments(parser: argparse.ArgumentParser, name: str) -> None:
 
 
 def run(driver: SchedulerDriver, failover: bool = False) -> int:
-    """Runs the driver until it has ended or SIGINT or SIGTERM comes; then stops it in order.
+    """Runs the driver until it has ended or SIGINT or SIGTERM comes; then stops it in order, or with a second one at
+    once.
 
-    A second signal does not wait any more. Gives the program's exit code: 0 when the scheduler stopped the driver.
+    For the main thread. Gives the program's exit code: 0 when the scheduler stopped the driver.
     """
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s")
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    came: list[int] = []
+    # They only take note: an exception out of nowhere could leave the driver half started.
+    before = {number: signal.signal(number, lambda which, _: came.append(which)) for number in _ENDING}
     try:
-        state = driver.run()
-    except KeyboardInterrupt:
-        try:
-            driver.stop(failover)
-            driver.join()
-        except KeyboardInterrupt:
-            driver.abort()
-        return INTERRUPTED
+        driver.start()
+        while driver.join(_SIGNAL_SECONDS) in (DriverState.RUNNING, DriverState.STOPPING):
+            if len(came) > 1:
+                driver.abort()
+            elif came:
+                driver.stop(failover)
     except MusterError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
-    return 0 if state is state.STOPPED else 1
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    if came:
+        return INTERRUPTED
+    return 0 if driver.state is DriverState.STOPPED else 1
