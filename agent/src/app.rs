@@ -25,6 +25,7 @@ use crate::config::{Args, Config, ConfigError, Identity, Kind};
 use crate::contact::Contact;
 use crate::driver::{Shared, chain};
 use crate::durable::FileError;
+use crate::footprint;
 use crate::link::join::{self, Credentials, JoinError};
 use crate::link::session::{Command, Link};
 use crate::link::token::{Token, TokenError};
@@ -182,11 +183,11 @@ pub async fn serve(
     }
     // Only now: a join that failed must not tie the directory to a name.
     identity.write(&config.data_dir)?;
-
     config.declared.keep(&config.data_dir)?;
     if !config.remembered.is_empty() {
         tracing::info!(flags = config.remembered.join(" "), "not given now; kept as given last");
     }
+
     let enforcer = enforcer(&identity.id).await;
     let enforced = match &enforcer {
         Ok(kernel) => Ok(Enforced {
@@ -249,13 +250,19 @@ pub async fn serve(
     };
     let engine = tokio::spawn(async move { docker.run().await });
     let session = tokio::spawn(link.run(node));
+    let mut settled = false;
     loop {
         // Cancel-safe: receivers, a join and a token.
         tokio::select! {
             () = shutdown.cancelled() => break,
             command = received.recv() => match command {
                 Some(Command::Assign(assignments)) => supervisor.assign(assignments),
-                Some(Command::Contact) => supervisor.tick(),
+                Some(Command::Contact) => {
+                    supervisor.tick();
+                    if !std::mem::replace(&mut settled, true) {
+                        footprint::give_back();
+                    }
+                }
                 // The link never ends by itself: it panicked. The tasks go on without it.
                 None => {
                     tracing::error!("the link is gone; start this agent again");
