@@ -15,6 +15,7 @@
 //! | [`cluster`] | the nodes with their ledgers, and the orders in which they are tried |
 //! | [`schedule`] | where a task goes, or why it goes nowhere (invariant 6) |
 //! | [`node_health`] | when a node counts as lost |
+//! | [`stray`] | what an agent runs and should not |
 //! | [`report`] | typed reasons, with the words people read |
 #![deny(missing_docs)]
 
@@ -24,3 +25,4 @@ pub mod node_health;
 pub mod report;
 pub mod schedule;
 pub mod space;
+pub mod stray;

@@ -12,7 +12,8 @@
 //! | `metadata`, `admission` | server-owned fields; violations, unknown fields |
 //! | `selector` | label and field selectors |
 //! | [`namespace`] | the default namespace; ending of namespaces |
-//! | [`token`], `join` | join tokens; certificates for agents |
+//! | [`token`], `join`, `enrol` | join tokens; certificates for agents; which agent speaks for a node |
+//! | `fence` | a person's word that a node is off |
 //! | `question` | plan, why, usage: answers that are no objects |
 //! | [`log`] | logs of tasks |
 //! | [`failure`] | every refusal as a `metav1.Status` |
@@ -22,7 +23,9 @@ mod body;
 pub mod create;
 pub mod delete;
 mod discovery;
+pub(crate) mod enrol;
 pub mod failure;
+mod fence;
 mod join;
 mod list;
 pub mod log;
@@ -144,6 +147,9 @@ async fn objects(call: Call, verb: Verb, object: Object) -> Answer {
     }
     if !object.allows(verb) {
         return Err(Failure::method_not_allowed(verb, &object));
+    }
+    if object.subresource == Some(Subresource::Fence) {
+        return fence::fence(call, object).await;
     }
     match verb {
         Verb::Get => list::get(&call, &object),
