@@ -175,11 +175,23 @@ pub async fn serve(
     let (kind, address) = settle(&config, &mut identity)?;
     let Some(name) = identity.node.clone() else { return Err(AgentError::Missing("--name")) };
     let credentials = Credentials::at(&config.data_dir);
-    if !credentials.exist() {
-        let token: Token =
-            config.token.as_deref().ok_or(AgentError::Missing("--token"))?.parse()?;
-        join::join(&address, &token, &name, kind, &credentials).await?;
-        tracing::info!(node = %name, controller = %address, "joined");
+    let token: Option<Token> = config.token.as_deref().map(str::parse).transpose()?;
+    match token {
+        None if !credentials.exist() => return Err(AgentError::Missing("--token")),
+        Some(token) if !credentials.exist() || !credentials.came_by(&token) => {
+            match join::join(&address, &token, &name, kind, &credentials).await {
+                Ok(()) => tracing::info!(node = %name, controller = %address, "joined"),
+                // A token that was left in a start script must not keep a joined robot out.
+                Err(error) if credentials.exist() => {
+                    tracing::warn!(
+                        error = chain(&error),
+                        "going on with the credentials of before"
+                    );
+                }
+                Err(error) => return Err(error.into()),
+            }
+        }
+        _ => {}
     }
     // Only now: a join that failed must not tie the directory to a name.
     identity.write(&config.data_dir)?;

@@ -77,8 +77,22 @@ pub(crate) enum Begin {
     New(TaskUid, Box<Assignment>, Desired),
     /// A task whose assignment cannot be read, and why.
     Unreadable(TaskUid, Box<Assignment>, String),
-    /// A task of an earlier life of the agent.
-    Restored(Box<Record>),
+    /// A task of an earlier life of the agent, and the first things to do about it.
+    Restored(Box<Record>, Response),
+}
+
+impl Begin {
+    /// Takes up a task of an earlier life of the agent, and shows its report: the first Hello must
+    /// name everything of which a process may live, however slow the disk is.
+    pub(crate) fn restore(shared: &Shared, mut record: Record) -> Begin {
+        let same_boot = record.boot_id == shared.boot_id;
+        record.boot_id.clone_from(&shared.boot_id);
+        let response = record.workload.restored(same_boot, context(shared));
+        if response.effects.contains(&Effect::Publish) {
+            publish(shared, &record);
+        }
+        Begin::Restored(Box::new(record), response)
+    }
 }
 
 pub(crate) async fn drive(
@@ -99,18 +113,9 @@ pub(crate) async fn drive(
             let boot_id = shared.boot_id.clone();
             (Record { boot_id, assignment: *assignment, workload }, response)
         }
-        Begin::Restored(record) => {
-            let mut record = *record;
-            let same_boot = record.boot_id == shared.boot_id;
-            record.boot_id.clone_from(&shared.boot_id);
-            let response = record.workload.restored(same_boot, context);
-            (record, response)
-        }
+        Begin::Restored(record, response) => (*record, response),
     };
-    let runtime = match Kind::of(&record.assignment.spec) {
-        Kind::Process => Arc::clone(&shared.process),
-        Kind::Docker => Arc::clone(&shared.docker),
-    };
+    let runtime = Arc::clone(runtime(&shared, &record));
     let mut driver = Driver {
         shared,
         runtime,
@@ -123,6 +128,20 @@ pub(crate) async fn drive(
     };
     driver.carry_out(response).await;
     driver.run().await;
+}
+
+fn runtime<'a>(shared: &'a Shared, record: &Record) -> &'a Arc<dyn Runtime> {
+    match Kind::of(&record.assignment.spec) {
+        Kind::Process => &shared.process,
+        Kind::Docker => &shared.docker,
+    }
+}
+
+fn publish(shared: &Shared, record: &Record) {
+    let (workload, runtime) = (&record.workload, runtime(shared, record));
+    let reserved = record.assignment.spec.resources.memory.map_or(0, |memory| memory.0);
+    let board = &shared.board;
+    board.publish(&workload.uid, &workload.report, workload.attempt, runtime, reserved);
 }
 
 fn context(shared: &Shared) -> Context {
@@ -167,7 +186,7 @@ impl Driver {
         for effect in response.effects {
             match effect {
                 Effect::Persist => self.persist().await,
-                Effect::Publish => self.publish(),
+                Effect::Publish => publish(&self.shared, &self.record),
                 Effect::WakeAt(at) => {
                     self.wakes.insert(at);
                 }
@@ -277,13 +296,6 @@ impl Driver {
         spec::launch(self.id(), &self.record.assignment, &around)
     }
 
-    fn publish(&self) {
-        let workload = &self.record.workload;
-        let reserved = self.record.assignment.spec.resources.memory.map_or(0, |memory| memory.0);
-        let board = &self.shared.board;
-        board.publish(&workload.uid, &workload.report, workload.attempt, &self.runtime, reserved);
-    }
-
     async fn persist(&mut self) {
         loop {
             let (shared, record) = (Arc::clone(&self.shared), self.record.clone());
@@ -389,6 +401,10 @@ mod tests {
 
     fn bench(dir: tempfile::TempDir, fake: Arc<Fake>, begin: Begin) -> Bench {
         let shared = shared(&dir, &fake);
+        run(dir, fake, shared, begin)
+    }
+
+    fn run(dir: tempfile::TempDir, fake: Arc<Fake>, shared: Arc<Shared>, begin: Begin) -> Bench {
         let (inbox, messages) = mpsc::unbounded_channel();
         let driver = tokio::spawn(drive(Arc::clone(&shared), begin, messages));
         Bench { dir, fake, shared, inbox, driver }
@@ -442,7 +458,12 @@ mod tests {
         let fake = Arc::new(Fake::default());
         fake.finds.lock().unwrap().push_back(Observed::Ended(exit(0)));
         let record = Checkpoint::open(dir.path()).unwrap().read_all().unwrap().remove(0);
-        let bench = super::tests::bench(dir, fake, Begin::Restored(Box::new(record)));
+        let shared = shared(&dir, &fake);
+        let begin = Begin::restore(&shared, record);
+        let told: Vec<Phase> =
+            shared.board.reports().iter().map(|(_, r, _)| r.content.phase).collect();
+        assert_eq!(told, [Phase::Running], "the first Hello names what may live");
+        let bench = run(dir, fake, shared, begin);
         let end = bench.report(|r| r.content.phase.is_terminal()).await;
         assert_eq!((end.content.phase, end.content.attempt), (Phase::Succeeded, 1));
         assert_eq!(bench.fake.asked(), ["find 1"]);

@@ -2,6 +2,7 @@
 
 mod cli;
 mod demo;
+mod fence;
 mod figure4;
 mod frameworks;
 mod lease;
