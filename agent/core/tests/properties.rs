@@ -392,9 +392,9 @@ proptest! {
     #[test]
     fn a_task_that_is_no_longer_assigned_tells_its_end_before_it_goes(
         policy in policy(),
-        prepare in any::<bool>(),
+        fetch in fetch(),
     ) {
-        let mut world = World::new(policy, prepare);
+        let mut world = World::new(policy, fetch);
         world.act(Action::Answer(0));
         world.act(Action::Unassign);
         world.settle();

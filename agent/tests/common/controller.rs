@@ -432,6 +432,7 @@ fn take(seen: &mut Seen, heard: Heard) {
             seen.reports.entry(report.uid.clone()).or_default().push(report);
             Some(Say::Task(ack))
         }
+        Heard::Message(_) => None,
         Heard::Log(chunk) => {
             let (text, end) = seen.logs.entry(chunk.id).or_default();
             text.extend_from_slice(&chunk.data);
