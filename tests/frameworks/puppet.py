@@ -16,9 +16,12 @@ class Puppet(muster.Scheduler):
     def __init__(self):
         self.held = {}
         self.lock = threading.Lock()
+        self.voice = threading.Lock()
 
     def say(self, **event):
-        print(json.dumps(event), flush=True)
+        # Two threads say things: callbacks and orders.
+        with self.voice:
+            print(json.dumps(event), flush=True)
 
     def say_held(self):
         self.say(
@@ -95,6 +98,9 @@ class Puppet(muster.Scheduler):
             launched = driver.launch_tasks(list(dict.fromkeys(offers_ids(offers))), infos).result(60)
             self.say(event="launched", tasks={one.name: one.task_id for one in launched.launched})
         except muster.CallRefused as refused:
+            # What a refused call named is still out, unless it is rescinded.
+            with self.lock:
+                self.held.update((offer.id, offer) for offer in offers)
             self.say(event="refused", reason=refused.reason.name, message=refused.message)
 
 
