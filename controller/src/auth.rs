@@ -21,7 +21,7 @@ pub enum Identity {
         /// The node's name.
         name: String,
         /// SHA-256 of the certificate's public key, hex. The Node says which keys are its agent's
-        /// (see [`crate::rest::enrol`]), so that a name alone admits nobody.
+        /// (see `rest::enrol`), so that a name alone admits nobody.
         key: String,
     },
     /// Somebody with a certificate of ours that says neither.

@@ -93,7 +93,7 @@ mod process {
 }
 
 mod container {
-    use muster_tests::{docker, wait};
+    use muster_tests::docker;
 
     use super::*;
 
