@@ -199,11 +199,15 @@ async fn discovery_tells_what_there_is() {
     assert_eq!(
         named,
         [
+            "frameworks",
+            "frameworks/status",
             "leases",
             "leases/status",
             "nodes",
             "nodes/fence",
             "nodes/status",
+            "quotas",
+            "quotas/status",
             "tasks",
             "tasks/log",
             "tasks/status"
