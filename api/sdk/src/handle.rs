@@ -32,12 +32,12 @@ impl FrameworkHandle {
 
     async fn call(&self, say: Say) -> Result<Vec<proto::Launched>, CallRefused> {
         let (answer, answered) = oneshot::channel();
-        let command = Command::Call { say, answer };
+        let command = Command::Call { say: Box::new(say), answer };
         self.commands.send(command).await.map_err(|_| CallRefused::ended())?;
         answered.await.unwrap_or_else(|_| Err(CallRefused::ended()))
     }
 
-    /// Launches tasks on the offers they name: all of them, or none. The offers are used up.
+    /// Launches tasks on the offers they name: all of them, or none. The offers are used up when it passes.
     pub async fn launch_tasks(
         &self,
         launches: impl IntoIterator<Item = Launch>,

@@ -257,7 +257,7 @@ contexts: [{{name: hall, context: {{cluster: hall, user: u, namespace: team}}}}]
         let (first, second) = (dir.path().join("first"), dir.path().join("second"));
         std::fs::write(&first, "current-context: hall").expect("written");
         std::fs::write(&second, text).expect("written");
-        let files = [first.clone(), dir.path().join("none"), second];
+        let files = [first, dir.path().join("none"), second];
         let target = load(&files).expect("usable");
         assert_eq!(target.address.to_string(), "[::1]:1");
         assert_eq!(target.namespace.as_deref(), Some("team"));

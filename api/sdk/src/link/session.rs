@@ -57,7 +57,7 @@ const MISSED_HEARTBEATS: u32 = 5;
 /// What the handle wants.
 #[derive(Debug)]
 pub(crate) enum Command {
-    Call { say: Say, answer: Answered },
+    Call { say: Box<Say>, answer: Answered },
     Acknowledge { task: String, version: u64 },
 }
 
@@ -339,10 +339,10 @@ impl Session {
     async fn command(&mut self, command: Command, line: &Line) -> Result<(), End> {
         match command {
             Command::Call { say, answer } => {
-                if let Say::Reconcile(reconcile) = &say {
+                if let Say::Reconcile(reconcile) = &*say {
                     self.seen.ask(&reconcile.tasks);
                 }
-                line.say(self.pending.add(say, answer)).await
+                line.say(self.pending.add(*say, answer)).await
             }
             // What is said of a task that there is not needs no acknowledgement.
             Command::Acknowledge { version: 0, .. } => Ok(()),
