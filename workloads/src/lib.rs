@@ -8,15 +8,15 @@
 //!
 //! | module | holds |
 //! |---|---|
-//! | [`clock`] | cpu time of this process; SIGTERM as a flag one can wait for |
-//! | [`pace`] | pure: cost of a frame → rate and units; the slow correction |
-//! | [`mod@run`] | the frame clock and its statistics |
-//! | [`scene`], [`rng`] | camera frames; seeded randomness |
-//! | [`gmapping`], [`monitoring`], [`recognition`] | the three workloads of the paper's Fig. 2 and 5 |
-//! | [`training`] | what recognition's framework keeps in the cloud |
-//! | [`drive`] | another task that wants the base |
-//! | [`mod@exit`] | exit codes, the same as the command's |
-//! | [`probe`] | spin, allocate, ignore-term, exit, io |
+//! | `clock` | cpu time of this process; SIGTERM as a flag one can wait for |
+//! | `pace` | pure: cost of a frame → rate and units; the slow correction |
+//! | `run` | the frame clock and its statistics |
+//! | `scene`, `rng` | camera frames; seeded randomness |
+//! | `gmapping`, `monitoring`, `recognition` | the three workloads of the paper's Fig. 2 and 5 |
+//! | `training` | what recognition's framework keeps in the cloud |
+//! | `drive` | another task that wants the base |
+//! | `exit` | exit codes, the same as the command's |
+//! | `probe` | spin, allocate, ignore-term, exit, io |
 //!
 //! Everything random comes from `--seed`; only rates and latencies differ between runs.
 

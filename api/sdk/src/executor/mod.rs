@@ -8,9 +8,9 @@
 //!
 //! | module | holds |
 //! |---|---|
-//! | [`connection`] | one connection at a time to the agent, made again whenever it breaks |
-//! | [`book`] | tasks that are not over and updates that are not acknowledged |
-//! | [`frame`] | messages behind their lengths |
+//! | `connection` | one connection at a time to the agent, made again whenever it breaks |
+//! | `book` | tasks that are not over and updates that are not acknowledged |
+//! | `frame` | messages behind their lengths |
 //!
 //! An executor is a task that a framework launched like any other; its tasks are launched with
 //! [`Launch::executor`](crate::Launch::executor).

@@ -9,12 +9,12 @@
 //!
 //! | module | is |
 //! |---|---|
-//! | [`session`] | one framework's session, whatever carries it |
-//! | [`subscribe`] | the first call: who it is, and its Framework object |
-//! | [`launch`] | the launches of an Accept → checked Task objects |
+//! | `session` | one framework's session, whatever carries it |
+//! | `subscribe` | the first call: who it is, and its Framework object |
+//! | `launch` | the launches of an Accept → checked Task objects |
 //! | [`updates`] | states of tasks → the mailboxes of their frameworks |
 //! | [`service`], [`lines`] | the two transports |
-//! | [`convert`] | what is said, as messages |
+//! | `convert` | what is said, as messages |
 
 pub(crate) mod convert;
 mod launch;
