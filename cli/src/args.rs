@@ -9,8 +9,8 @@ use muster_api::selector::{FieldSelector, LabelSelector, SelectorError};
 
 use crate::client::Selection;
 use crate::command::{
-    apply, cordon, delete, describe, drain, get, local, logs, node, plan, token, top, version,
-    wait, why,
+    apply, cordon, delete, describe, drain, get, local, logs, node, offers, plan, token, top,
+    version, wait, why,
 };
 use crate::output::ui::Color;
 
@@ -63,9 +63,11 @@ pub(crate) enum Command {
     Get(get::Args),
     /// Show everything about objects
     Describe(describe::Args),
-    /// Say where a task runs and why, or what keeps it from running
+    /// Say where a task runs and why, or what keeps it from running; why a framework is not offered a node
     Why(why::Args),
-    /// Delete objects
+    /// Show what frameworks are offered now
+    Offers(offers::Args),
+    /// Delete objects; a framework is torn down with its tasks
     Delete(delete::Args),
     /// Print what a task wrote
     Logs(logs::Args),
@@ -181,6 +183,10 @@ mod tests {
             "muster wait task/x --for delete",
             "muster wait node/r --for=jsonpath={.status.free.cpu}=2",
             "muster why task/x",
+            "muster why framework/x",
+            "muster offers",
+            "muster offers deliver -w -o json",
+            "muster offers -A",
             "muster plan -f dir",
             "muster cordon a b",
             "muster drain a --grace-period 5 --timeout 2m",
@@ -212,6 +218,7 @@ mod tests {
             "muster node register r1 --kind plane",
             "muster node fence r1 --yes",
             "muster plan",
+            "muster offers deliver -A",
         ] {
             assert_eq!(
                 read(line).expect_err(line).exit_code(),

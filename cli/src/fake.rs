@@ -56,6 +56,15 @@ pub(crate) fn task(name: &str, status: Value) -> Value {
     })
 }
 
+/// A framework that wants everything, with this status.
+pub(crate) fn framework(name: &str, status: Value) -> Value {
+    json!({
+        "apiVersion": muster_api::API_VERSION, "kind": "Framework",
+        "metadata": {"name": name, "namespace": "default", "uid": "u-1"},
+        "spec": {}, "status": status,
+    })
+}
+
 /// A robot with this status.
 pub(crate) fn node(name: &str, status: Value) -> Value {
     json!({
@@ -272,6 +281,12 @@ async fn handle(State(fake): State<Fake>, method: Method, uri: Uri, body: Bytes)
     let Some(path) = Path::read(uri.path()) else {
         return failure(StatusCode::NOT_FOUND, "NotFound", "no such path", Value::Null);
     };
+    if path.plural == "frameworks" && matches!(method, Method::POST | Method::PATCH) {
+        let verb = if method == Method::POST { "create" } else { "patch" };
+        let message = format!("{verb} is not supported on frameworks.muster.dev");
+        let code = StatusCode::METHOD_NOT_ALLOWED;
+        return failure(code, "MethodNotAllowed", &message, Value::Null);
+    }
     let dry = parameters.contains_key("dryRun");
     match (method, path.name.clone()) {
         (Method::GET, None) if parameters.contains_key("watch") => follow(fake, path, parameters),

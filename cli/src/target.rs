@@ -82,13 +82,18 @@ fn pair(word: &str) -> Result<Named<'_>, CliError> {
 
 /// Reads a word that names one object of a kind that is known, `x` or `task/x`.
 pub(crate) fn one<'a>(word: &'a str, of: &str) -> Result<Named<'a>, CliError> {
-    let wanted = kind(of)?;
-    if !word.contains('/') {
-        return Ok(Named { info: wanted, name: Some(word) });
+    one_of(word, &[of])
+}
+
+/// Reads a word that names one object of some kinds; `x` alone is of the first.
+pub(crate) fn one_of<'a>(word: &'a str, kinds: &[&str]) -> Result<Named<'a>, CliError> {
+    let wanted = kinds.iter().map(|k| kind(k)).collect::<Result<Vec<_>, _>>()?;
+    if let Some(info) = wanted.first().copied().filter(|_| !word.contains('/')) {
+        return Ok(Named { info, name: Some(word) });
     }
     let named = pair(word)?;
-    if named.info.kind != wanted.kind {
-        return Err(CliError::usage(format!("{word} is not a {of}")));
+    if wanted.iter().all(|info| info.kind != named.info.kind) {
+        return Err(CliError::usage(format!("{word} is not a {}", kinds.join(" or a "))));
     }
     Ok(named)
 }
@@ -145,5 +150,10 @@ mod tests {
         assert_eq!(one("x", "task").expect("a name").name, Some("x"));
         assert_eq!(one("tk/x", "task").expect("a pair").name, Some("x"));
         one("node/x", "task").expect_err("another kind");
+        let kinds = ["task", "framework"];
+        assert_eq!(one_of("x", &kinds).expect("a name").info.kind, "Task");
+        assert_eq!(one_of("fw/x", &kinds).expect("a pair").info.kind, "Framework");
+        let error = one_of("node/x", &kinds).expect_err("a third kind");
+        assert_eq!(error.to_string(), "node/x is not a task or a framework");
     }
 }

@@ -146,10 +146,31 @@ fn annotate(object: &mut Value, annotation: Value) {
 async fn perform(client: &Client, step: &Step, mode: Mode) -> Result<Value, CliError> {
     let Manifest { info, namespace, name, .. } = &step.manifest;
     let namespace = namespace.as_deref();
-    match &step.action {
+    let done = match &step.action {
         Action::Create(object) => client.create(info, namespace, object, mode).await,
         Action::Patch { patch, .. } => client.patch(info, namespace, name, patch, mode).await,
         Action::Nothing(current) => Ok(current.clone()),
+    };
+    done.map_err(|error| not_by_manifest(error, &step.manifest))
+}
+
+/// Some kinds are made by what they stand for; the controller only says that it does not serve the verb.
+fn not_by_manifest(error: CliError, manifest: &Manifest) -> CliError {
+    let made = match manifest.info.kind {
+        "Framework" => {
+            "a Framework is made by the framework when it subscribes, and says there what it wants"
+        }
+        "Lease" => "a Lease is made by the controller when a robot with actuators joins",
+        _ => return error,
+    };
+    match error {
+        CliError::Refused(mut refusal) if refusal.reason == "MethodNotAllowed" => {
+            refusal.message =
+                format!("{} cannot be applied: {}", manifest.title(), refusal.message);
+            refusal.hint = Some(made.to_owned());
+            CliError::Refused(refusal)
+        }
+        other => other,
     }
 }
 
@@ -388,6 +409,21 @@ spec:
         let printed = fake.run(&["apply", "-f", &path, "--dry-run"]).await;
         assert_eq!(printed, (exit::OK, "task/one created (dry run)\n".to_owned()));
         assert_eq!(fake.object("tasks/default/one"), None);
+    }
+
+    #[tokio::test]
+    async fn a_framework_is_not_made_by_a_manifest() {
+        let dir = tempfile::tempdir().expect("a directory");
+        let path = file(
+            &dir,
+            "apiVersion: muster.dev/v1alpha1\nkind: Framework\nmetadata: {name: deliver}\nspec: {}\n",
+        );
+        let error = Fake::new().try_run(&["apply", "-f", &path]).await.expect_err("refused");
+        assert_eq!(
+            error.render(&crate::output::style::Styles::default()),
+            "error: framework/deliver cannot be applied: create is not supported on frameworks.muster.dev\n\
+             hint: a Framework is made by the framework when it subscribes, and says there what it wants\n"
+        );
     }
 
     #[tokio::test]

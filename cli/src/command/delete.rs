@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use clap::ArgAction;
 use muster_api::duration::Span;
 use muster_api::kind::KindInfo;
+use muster_api::kind::framework::FRAMEWORK_LABEL;
 use serde_json::Value;
 
 use super::gone::{Doomed, until_gone};
@@ -12,6 +13,7 @@ use super::{FirstError, Outcome};
 use crate::args::{Select, span};
 use crate::error::CliError;
 use crate::manifests;
+use crate::output::human;
 use crate::output::objects::full_name;
 use crate::session::Session;
 use crate::target::{self, Named};
@@ -19,7 +21,7 @@ use crate::target::{self, Named};
 /// `muster delete`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
-    /// KIND NAME…, KIND/NAME…, or KIND with -l or --all
+    /// KIND NAME…, KIND/NAME…, or KIND with -l or --all; with a framework go its session and its tasks
     #[arg(value_name = "OBJECT", required_unless_present = "filename")]
     objects: Vec<String>,
     /// What manifests name: a file, a directory, or - for standard input
@@ -66,7 +68,7 @@ pub(crate) async fn run(args: Args, session: &mut Session) -> Outcome {
     for victim in &victims {
         match end(victim, grace, session).await {
             Ok(one) => {
-                session.ui.line(&format!("{} deleted", full_name(victim.info, &one.object)))?;
+                session.ui.line(&sentence(victim, &one))?;
                 doomed.push(one);
             }
             Err(error) if error.is_not_found() && args.ignore_not_found => {}
@@ -122,6 +124,18 @@ async fn victims(args: &Args, session: &mut Session) -> Result<Vec<Victim>, CliE
     Ok(victims)
 }
 
+fn sentence(victim: &Victim, doomed: &Doomed) -> String {
+    let name = full_name(victim.info, &doomed.object);
+    let tasks = doomed.object.pointer("/status/tasks").and_then(Value::as_u64).unwrap_or(0);
+    match (victim.info.kind, usize::try_from(tasks)) {
+        ("Framework", Ok(tasks @ 1..)) => {
+            let tasks = human::count(tasks, "task");
+            format!("{name} deleted; with it {tasks} (-l {FRAMEWORK_LABEL}={})", victim.name)
+        }
+        _ => format!("{name} deleted"),
+    }
+}
+
 async fn end(victim: &Victim, grace: Option<u32>, session: &Session) -> Result<Doomed, CliError> {
     let Victim { info, namespace, name } = victim;
     let namespace = namespace.as_deref();
@@ -136,7 +150,7 @@ mod tests {
     use serde_json::json;
 
     use crate::exit;
-    use crate::fake::{Fake, task};
+    use crate::fake::{Fake, framework, task};
 
     #[tokio::test]
     async fn by_name_selector_and_all() {
@@ -161,6 +175,24 @@ mod tests {
             fake.run(&["delete", "tasks", "--all"]).await.1,
             "task/c deleted\ntask/d deleted\n"
         );
+    }
+
+    #[tokio::test]
+    async fn a_framework_goes_with_its_tasks() {
+        let fake = Fake::new();
+        let there = json!({"connected": true, "tasks": 2});
+        fake.put("frameworks/default/deliver", framework("deliver", there));
+        fake.put("frameworks/default/idle", framework("idle", json!({})));
+        assert_eq!(
+            fake.run(&["delete", "framework", "deliver", "idle"]).await,
+            (
+                exit::OK,
+                "framework/deliver deleted; with it 2 tasks (-l muster.dev/framework=deliver)\n\
+                 framework/idle deleted\n"
+                    .to_owned()
+            )
+        );
+        assert_eq!(fake.object("frameworks/default/deliver"), None);
     }
 
     #[tokio::test]

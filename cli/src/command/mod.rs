@@ -12,6 +12,7 @@ pub(crate) mod gone;
 pub(crate) mod local;
 pub(crate) mod logs;
 pub(crate) mod node;
+pub(crate) mod offers;
 pub(crate) mod plan;
 pub(crate) mod settle;
 pub(crate) mod token;
@@ -72,6 +73,7 @@ pub(crate) async fn dispatch(command: Command, session: &mut Session) -> Outcome
         Command::Get(args) => get::run(args, session).await,
         Command::Describe(args) => describe::run(args, session).await,
         Command::Why(args) => why::run(args, session).await,
+        Command::Offers(args) => offers::run(args, session).await,
         Command::Delete(args) => delete::run(args, session).await,
         Command::Logs(args) => logs::run(args, session).await,
         Command::Top(args) => top::run(args, session).await,

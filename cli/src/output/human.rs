@@ -3,6 +3,7 @@
 use std::time::Duration;
 
 use jiff::Timestamp;
+use muster_api::pose::{DEFAULT_MAP, OperationPosition};
 use muster_api::quantity::{Bytes, MilliCpu};
 
 /// A span of time in its one or two largest units, as kubectl writes it: `45s`, `4m12s`, `3h`, `9d`.
@@ -28,6 +29,12 @@ pub(crate) fn duration(span: Duration) -> String {
     }
 }
 
+/// What is left of a span that began at `since`; whole seconds.
+pub(crate) fn left(span: Duration, since: Timestamp, now: Timestamp) -> String {
+    let gone = now.as_second().saturating_sub(since.as_second()).max(0);
+    duration(span.saturating_sub(Duration::from_secs(gone.unsigned_abs())))
+}
+
 /// How long ago `then` was; whole seconds, and never negative: clocks differ.
 pub(crate) fn age(then: Timestamp, now: Timestamp) -> String {
     let seconds = now.as_second().saturating_sub(then.as_second()).max(0);
@@ -49,6 +56,13 @@ pub(crate) fn bytes(amount: Bytes) -> String {
 /// An amount of cpu in cores: `0.25`, `1.5`, `2`.
 pub(crate) fn cores(amount: MilliCpu) -> String {
     format!("{}", amount.cores())
+}
+
+/// A place in a cell, as poses are written: metres, and the map where it is not the usual one.
+pub(crate) fn place(at: &OperationPosition) -> String {
+    let z = if at.z == 0.0 { String::new() } else { format!(",{:.2}", at.z) };
+    let map = if at.map == DEFAULT_MAP { String::new() } else { format!(" in {}", at.map) };
+    format!("{:.2},{:.2}{z}{map}", at.x, at.y)
 }
 
 /// `part` of `whole` in percent; `-` of nothing.
@@ -114,6 +128,9 @@ mod tests {
         let at = |s| Timestamp::from_second(s).expect("in range");
         assert_eq!(age(at(100), at(145)), "45s");
         assert_eq!(age(at(100), at(90)), "0s");
+        let minute = Duration::from_secs(60);
+        assert_eq!(left(minute, at(100), at(112)), "48s");
+        assert_eq!(left(minute, at(100), at(200)), "0s");
     }
 
     #[test]

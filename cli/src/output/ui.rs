@@ -28,6 +28,8 @@ pub(crate) struct Ui {
     /// For standard error.
     err_styles: Styles,
     live: bool,
+    /// Standard output is a terminal, where a picture can be drawn over the last one.
+    redraws: bool,
 }
 
 impl Ui {
@@ -45,11 +47,12 @@ impl Ui {
             }
             styles
         };
+        let moves_cursor = std::env::var_os("TERM").is_none_or(|t| t != "dumb");
         Ui {
             styles: styles(AutoStream::choice(&io::stdout())),
             err_styles: styles(AutoStream::choice(&io::stderr())),
-            live: io::stderr().is_terminal()
-                && std::env::var_os("TERM").is_none_or(|t| t != "dumb"),
+            live: moves_cursor && io::stderr().is_terminal(),
+            redraws: moves_cursor && io::stdout().is_terminal(),
             out: Box::new(io::stdout()),
         }
     }
@@ -57,7 +60,13 @@ impl Ui {
     /// Output into `out`, plain; for tests.
     #[cfg(test)]
     pub(crate) fn plain(out: Box<dyn Write + Send>) -> Self {
-        Ui { out, styles: Styles::default(), err_styles: Styles::default(), live: false }
+        Ui {
+            out,
+            styles: Styles::default(),
+            err_styles: Styles::default(),
+            live: false,
+            redraws: false,
+        }
     }
 
     /// Data.
@@ -72,6 +81,17 @@ impl Ui {
             io::ErrorKind::BrokenPipe => CliError::BrokenPipe,
             _ => CliError::Output(error),
         })
+    }
+
+    /// Whether [`Ui::redraw`] shows one picture instead of the next under the last.
+    pub(crate) fn redraws(&self) -> bool {
+        self.redraws
+    }
+
+    /// Data instead of what is on the terminal. In one piece, so that it does not flicker.
+    pub(crate) fn redraw(&mut self, text: &str) -> Result<(), CliError> {
+        const HOME_AND_CLEAR: &str = "\u{1b}[H\u{1b}[2J";
+        self.print(&format!("{HOME_AND_CLEAR}{text}"))
     }
 
     /// A line of data.

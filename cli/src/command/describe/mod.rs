@@ -2,8 +2,10 @@
 //! say than its fields.
 
 mod any;
+mod framework;
 mod lease;
 mod node;
+mod quota;
 mod task;
 
 use jiff::Timestamp;
@@ -11,6 +13,9 @@ use k8s_openapi::apimachinery::pkg::apis::meta::v1::ObjectMeta;
 use muster_api::condition::{Condition, ConditionStatus};
 use muster_api::kind::KindInfo;
 use muster_api::kind::event::Event;
+use muster_api::kind::quota::Quota;
+use muster_api::kind::task::{Cost, NodeChoice, Task};
+use muster_api::pose::OperationPosition;
 use serde_json::Value;
 
 use super::Outcome;
@@ -81,8 +86,20 @@ async fn describe(
     match info.kind {
         "Node" => {
             let node = serde_json::from_value(object).map_err(read)?;
-            let tasks = node::tasks_on(&node, session).await?;
+            let tasks = holding(None, node::on_it(&node), session).await?;
             node::describe(&mut sheet, &node, &tasks, now);
+        }
+        "Framework" => {
+            let framework = serde_json::from_value(object).map_err(read)?;
+            let (namespace, its) = framework::its_tasks(&framework);
+            let tasks = holding(namespace, its, session).await?;
+            framework::describe(&mut sheet, &framework, &tasks, now);
+        }
+        "Quota" => {
+            let quota: Quota = serde_json::from_value(object).map_err(read)?;
+            let namespace = quota.metadata.namespace.as_deref();
+            let tasks = holding(namespace, Selection::default(), session).await?;
+            quota::describe(&mut sheet, &quota, &tasks, now);
         }
         "Task" => task::describe(&mut sheet, &serde_json::from_value(object).map_err(read)?, now),
         "Lease" => lease::describe(&mut sheet, &serde_json::from_value(object).map_err(read)?, now),
@@ -111,6 +128,38 @@ fn begin(sheet: &mut Sheet, metadata: &ObjectMeta, now: Timestamp) {
     let owners = metadata.owner_references.iter().flatten();
     sheet.list("Owned by", owners.map(|o| format!("{}/{}", o.kind.to_lowercase(), o.name)));
     sheet.list("Finalizers", metadata.finalizers.iter().flatten().cloned());
+}
+
+/// The selected tasks that hold something of a node; of no namespace: of all.
+async fn holding(
+    namespace: Option<&str>,
+    selection: Selection,
+    session: &Session,
+) -> Result<Vec<Task>, CliError> {
+    let list = session.client.list(target::kind("task")?, namespace, &selection).await?;
+    let tasks = list.items.into_iter().filter_map(|o| serde_json::from_value::<Task>(o).ok());
+    Ok(tasks.filter(|t| t.status.as_ref().is_some_and(|s| s.phase.holds_node())).collect())
+}
+
+/// `3.00,4.00 in "lab"`.
+fn position(at: &OperationPosition) -> String {
+    let z = if at.z == 0.0 { String::new() } else { format!(",{:.2}", at.z) };
+    format!("{:.2},{:.2}{z} in {:?}", at.x, at.y, at.map)
+}
+
+fn scored_by(cost: Cost) -> &'static str {
+    match cost {
+        Cost::Distance => "distance",
+        Cost::TravelTime => "travel time",
+    }
+}
+
+fn which_node(choice: NodeChoice) -> &'static str {
+    match choice {
+        NodeChoice::Any => "any node",
+        NodeChoice::Robot => "Robot",
+        NodeChoice::Cloud => "Cloud",
+    }
 }
 
 /// `5m ago (2026-01-02T03:04:05Z)`.
@@ -180,7 +229,7 @@ mod tests {
     use serde_json::json;
 
     use crate::exit;
-    use crate::fake::{Fake, node, task};
+    use crate::fake::{Fake, framework, node, task};
 
     #[tokio::test]
     async fn a_node_says_what_it_has_who_drives_it_and_what_runs_there() {
@@ -247,6 +296,71 @@ mod tests {
         ] {
             let squeezed = |t: &str| t.split_whitespace().collect::<Vec<_>>().join(" ");
             assert!(squeezed(&text).contains(&squeezed(part)), "{part:?} is not in\n{text}");
+        }
+    }
+    #[tokio::test]
+    async fn a_framework_says_what_it_wants_and_what_it_has() {
+        let fake = Fake::new();
+        let mut object = framework(
+            "deliver",
+            json!({"connected": false, "disconnectedAt": "2026-01-02T03:04:05Z", "share": 0.25}),
+        );
+        object["spec"] = json!({
+            "position": {"x": 3, "y": 4, "map": "lab"}, "radius": 8, "failoverTimeout": "5m",
+            "filter": {"on": "Robot", "minimum": {"cpu": "500m"}, "actuators": ["base:Drive"], "most": 2},
+        });
+        fake.put("frameworks/default/deliver", object);
+        let mut t = task("t", json!({"phase": "Running", "node": "r1"}));
+        t["spec"]["resources"] = json!({"cpu": "500m"});
+        fake.put("tasks/default/t", t);
+        let (code, text) = fake.run(&["describe", "fw", "deliver"]).await;
+        assert_eq!(code, exit::OK);
+        let labels = "labelSelector=muster.dev%2Fframework%3Ddeliver";
+        assert!(fake.requests().iter().any(|r| r.contains(labels)), "{:?}", fake.requests());
+        for part in [
+            "Id:              u-1",
+            "Connected:       no",
+            "Away at most:    5m; its tasks are ended in 0s if it does not come back",
+            "Share:           0.25",
+            "At:            3.00,4.00 in \"lab\"",
+            "Radius:        8 m",
+            "Cpu:           0.5 free at least",
+            "Actuators:     base:Drive",
+            "At once:       2 offers at most",
+            "t      Running   r1     CR      -",
+        ] {
+            assert!(text.contains(part), "{part:?} is not in\n{text}");
+        }
+    }
+
+    #[tokio::test]
+    async fn a_quota_stands_beside_what_the_namespace_has() {
+        let fake = Fake::new();
+        fake.put(
+            "quotas/default/default",
+            json!({
+                "apiVersion": "muster.dev/v1alpha1", "kind": "Quota",
+                "metadata": {"name": "default", "namespace": "default"},
+                "spec": {"hard": {"cpu": "4", "leases": 2, "extended": {"gpu": 1}}, "weight": 2},
+            }),
+        );
+        let lease = json!({"name": "r1.body", "epoch": 3});
+        let mut driver = task("a", json!({"phase": "Running", "node": "r1", "lease": lease}));
+        driver["spec"]["resources"] = json!({"cpu": "500m", "memory": "64Mi"});
+        fake.put("tasks/default/a", driver.clone());
+        // What has ended holds nothing.
+        driver["status"]["phase"] = "Succeeded".into();
+        fake.put("tasks/default/b", driver);
+        let (_, text) = fake.run(&["describe", "quota", "default"]).await;
+        for line in [
+            "Weight:          2",
+            "           USED   HARD",
+            "  cpu      0.5    4",
+            "  memory   64Mi   -",
+            "  leases   1      2",
+            "  gpu      0      1",
+        ] {
+            assert!(text.lines().any(|l| l == line), "{line:?} is not in\n{text}");
         }
     }
 }

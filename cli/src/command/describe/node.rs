@@ -9,22 +9,16 @@ use muster_api::resource::Compute;
 
 use super::{begin, condition_table, when};
 use crate::client::Selection;
-use crate::error::CliError;
 use crate::output::columns::task as columns;
 use crate::output::human;
 use crate::output::sheet::Sheet;
 use crate::output::style::Mood;
 use crate::output::table::{Cell, Table};
-use crate::session::Session;
-use crate::target;
 
-/// The tasks that hold something of the node.
-pub(super) async fn tasks_on(node: &Node, session: &Session) -> Result<Vec<Task>, CliError> {
+/// The tasks that are on the node.
+pub(super) fn on_it(node: &Node) -> Selection {
     let name = node.metadata.name.as_deref().unwrap_or_default();
-    let on = Selection { labels: None, fields: Some(format!("status.node={name}")) };
-    let list = session.client.list(target::kind("task")?, None, &on).await?;
-    let tasks = list.items.into_iter().filter_map(|o| serde_json::from_value::<Task>(o).ok());
-    Ok(tasks.filter(|t| t.status.as_ref().is_some_and(|s| s.phase.holds_node())).collect())
+    Selection { labels: None, fields: Some(format!("status.node={name}")) }
 }
 
 pub(super) fn describe(sheet: &mut Sheet, node: &Node, tasks: &[Task], now: Timestamp) {

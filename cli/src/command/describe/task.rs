@@ -2,11 +2,10 @@
 
 use jiff::Timestamp;
 use muster_api::kind::task::{
-    ContainerRun, Cost, EnvVar, NodeChoice, Placement, ProcessRun, Resources, Task, TaskSpec,
-    TaskStatus,
+    ContainerRun, EnvVar, Placement, ProcessRun, Resources, Task, TaskSpec, TaskStatus,
 };
 
-use super::{begin, when};
+use super::{begin, position, scored_by, when, which_node};
 use crate::command::why::refusal_table;
 use crate::output::columns::task as columns;
 use crate::output::human;
@@ -48,29 +47,14 @@ fn state(sheet: &mut Sheet, task: &Task, status: &TaskStatus, now: Timestamp) {
 fn placement(sheet: &mut Sheet, placement: &Placement) {
     sheet.heading("Placement");
     if let Some(at) = &placement.at {
-        let mut text = format!("{:.2},{:.2}", at.x, at.y);
-        if at.z != 0.0 {
-            text.push_str(&format!(",{:.2}", at.z));
-        }
-        text.push_str(&format!(" in {:?}", at.map));
+        let mut text = position(at);
         if let Some(within) = placement.within {
             text.push_str(&format!(", within {within} m"));
         }
         sheet.field("At", text);
-        let cost = match placement.cost {
-            Cost::Distance => "distance",
-            Cost::TravelTime => "travel time",
-        };
-        sheet.field("Scored by", cost);
+        sheet.field("Scored by", scored_by(placement.cost));
     }
-    sheet.field(
-        "On",
-        match placement.on {
-            NodeChoice::Any => "any node",
-            NodeChoice::Robot => "Robot",
-            NodeChoice::Cloud => "Cloud",
-        },
-    );
+    sheet.field("On", which_node(placement.on));
     sheet.maybe("Pinned to", placement.node.clone());
     if !placement.selector.is_empty() {
         sheet.field("With labels", placement.selector.to_string());

@@ -1,18 +1,22 @@
 //! The columns of each kind: one file a kind. A kind without a file gets NAME and AGE.
 
 pub(crate) mod event;
+pub(crate) mod framework;
 mod lease;
 mod namespace;
 mod node;
+mod quota;
 pub(crate) mod task;
 
 use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 use muster_api::kind::KindInfo;
 use muster_api::kind::event::Event;
+use muster_api::kind::framework::Framework;
 use muster_api::kind::lease::Lease;
 use muster_api::kind::namespace::Namespace;
 use muster_api::kind::node::Node;
+use muster_api::kind::quota::Quota;
 use muster_api::kind::task::Task;
 use serde::de::DeserializeOwned;
 use serde_json::Value;
@@ -58,6 +62,8 @@ pub(crate) fn table(info: &KindInfo, objects: &[Value], layout: Layout) -> Table
         "Node" => typed::<Node>(node::COLUMNS, info, objects, layout),
         "Task" => typed::<Task>(task::COLUMNS, info, objects, layout),
         "Lease" => typed::<Lease>(lease::COLUMNS, info, objects, layout),
+        "Framework" => typed::<Framework>(framework::COLUMNS, info, objects, layout),
+        "Quota" => typed::<Quota>(quota::COLUMNS, info, objects, layout),
         "Namespace" => typed::<Namespace>(namespace::COLUMNS, info, objects, layout),
         "Event" => typed::<Event>(event::COLUMNS, info, &event::by_time(objects), layout),
         _ => generic(info, objects, layout),

@@ -1,94 +1,39 @@
-//! `muster why`: where a task runs and why there, how it ended, or, per node, what refuses it.
+//! A task: where it runs and why there, how it ended, or, per node, what refuses it.
 
 use muster_api::kind::task::{Cost, NodeRefusal, Task, TaskStatus};
 use muster_api::phase::TaskPhase;
-use serde::Deserialize;
 use serde_json::{Value, json};
 
-use super::Outcome;
-use crate::client::path;
-use crate::error::CliError;
-use crate::exit;
+use super::{Asked, advice, refusals_and_hints};
 use crate::output::columns::task as columns;
 use crate::output::human;
-use crate::output::objects::{Format, document};
-use crate::output::table::Table;
-use crate::session::Session;
-use crate::target;
+use crate::output::style::Styles;
 
-/// `muster why`.
-#[derive(Debug, clap::Args)]
-pub(crate) struct Args {
-    /// The task, NAME or task/NAME
-    task: String,
-    /// Print what the controller says, for programs
-    #[arg(short, long, value_enum, value_name = "FORMAT")]
-    output: Option<Format>,
-}
-
-/// What `…/tasks/NAME/why` answers.
-#[derive(Debug, Deserialize)]
-struct Answer {
-    #[serde(default)]
-    why: Vec<NodeRefusal>,
-}
-
-pub(crate) async fn run(args: Args, session: &mut Session) -> Outcome {
-    let named = target::one(&args.task, "task")?;
-    let name = named.name.unwrap_or_default();
-    let namespace = session.namespace.clone();
-    let object = session.client.get(named.info, Some(&namespace), name).await?;
-    let uri = format!("{}/why", path(named.info, Some(&namespace), Some(name)));
-    let answer: Option<Value> = match session.client.get_json(&uri).await {
-        Ok(answer) => Some(answer),
-        // An older controller, or one whose scheduler is not up: the status has the essence.
-        Err(error) if error.is_not_found() => None,
-        Err(error) => return Err(error),
-    };
-    let task: Task = serde_json::from_value(object).map_err(|source| CliError::Answer {
-        server: session.client.server.clone(),
-        request: format!("task/{name}"),
-        source,
-    })?;
+/// The text, and what programs get when the controller has no answer of its own.
+pub(super) fn told(
+    asked: &Asked<'_>,
+    styles: &Styles,
+) -> Result<(String, Value), serde_json::Error> {
+    let task: Task = serde_json::from_value(asked.object.clone())?;
     let status = task.status.clone().unwrap_or_default();
-    let full: Option<Answer> = answer.clone().and_then(|a| serde_json::from_value(a).ok());
-    let why = full.map_or_else(|| status.why.clone(), |a| a.why);
-    match args.output {
-        Some(format @ (Format::Yaml | Format::Json)) => {
-            let value = answer
-                .unwrap_or_else(|| json!({"phase": status.phase, "why": why, "decision": null}));
-            session.ui.print(&document(&value, format)?)?;
-        }
-        _ => {
-            let text = story(name, &task, &status, &why, session);
-            session.ui.print(&text)?;
-        }
-    }
-    Ok(exit::OK)
+    let why = asked.refusals().unwrap_or_else(|| status.why.clone());
+    let text = story(asked.name, &task, &why, styles);
+    Ok((text, json!({"phase": status.phase, "why": why, "decision": null})))
 }
 
-fn story(
-    name: &str,
-    task: &Task,
-    status: &TaskStatus,
-    why: &[NodeRefusal],
-    session: &Session,
-) -> String {
-    let styles = &session.ui.styles;
-    let mut text = format!("{}\n", headline(name, status));
+fn story(name: &str, task: &Task, why: &[NodeRefusal], styles: &Styles) -> String {
+    let status = task.status.clone().unwrap_or_default();
+    let mut text = format!("{}\n", headline(name, &status));
     match status.phase {
         TaskPhase::Pending if why.is_empty() => {
             text.push_str("The scheduler has not looked at it yet.\n");
         }
         TaskPhase::Pending => {
-            text.push_str(&format!("\n{}", refusal_table(why).text(styles)));
-            for (i, advice) in advice(why).into_iter().enumerate() {
-                let gap = if i == 0 { "\n" } else { "" };
-                text.push_str(&format!("{gap}{} {advice}\n", styles.dim.paint("hint:")));
-            }
+            let hints = advice(why, "spec.placement.within");
+            text.push_str(&refusals_and_hints(why, &hints, styles));
         }
         _ => {
-            for line in placed(task, status) {
+            for line in placed(task, &status) {
                 text.push_str(&format!("{line}\n"));
             }
             if !status.message.is_empty() {
@@ -180,48 +125,6 @@ fn placed(task: &Task, status: &TaskStatus) -> Vec<String> {
         lines.push(format!("It {verb} the lease {}, epoch {}.", lease.name, lease.epoch));
     }
     lines
-}
-
-/// Each node with the filter that refuses the task and what would have to change.
-pub(crate) fn refusal_table(why: &[NodeRefusal]) -> Table {
-    let mut table = Table::new(["NODE", "REFUSED BY", "WHY"]);
-    for refusal in why {
-        let node = if refusal.node.is_empty() { "(all)" } else { &refusal.node };
-        table.push([node, refusal.reason.as_str(), refusal.message.as_str()]);
-    }
-    table
-}
-
-/// Commands that help with the filters that refuse.
-fn advice(why: &[NodeRefusal]) -> Vec<&'static str> {
-    let known: [(&[&str], &str); 5] = [
-        (
-            &["LeaseHeld"],
-            "`muster get leases` shows who drives; when the holder ends, the lease is free",
-        ),
-        (
-            &["Exhausted"],
-            "`muster top nodes` shows what is used; `muster describe node/NAME` who reserved it",
-        ),
-        (&["NotReady"], "`muster describe node/NAME` shows when the node was last heard"),
-        (
-            &["OutOfRange", "OtherMap"],
-            "`muster get nodes` shows where the robots are; spec.placement.within is how far they may be",
-        ),
-        (
-            &["TooSmall", "NoSensor", "NoActuator", "WrongKind"],
-            "what a node does not have will not come by waiting: `muster get nodes -o wide`",
-        ),
-    ];
-    let refuses = |words: &[&str]| why.iter().any(|r| words.contains(&r.reason.as_str()));
-    // What will not come by waiting matters only when no node is merely busy.
-    let busy =
-        refuses(&["LeaseHeld", "Exhausted", "NotReady", "OutOfRange", "OtherMap", "Cordoned"]);
-    known
-        .into_iter()
-        .filter(|(words, _)| refuses(words) && !(busy && words.contains(&"TooSmall")))
-        .map(|(_, text)| text)
-        .collect()
 }
 
 #[cfg(test)]

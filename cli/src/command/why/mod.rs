@@ -1,0 +1,168 @@
+//! `muster why`: where a task runs and why there, how it ended, or, per node, what refuses it; and why nodes are not
+//! offered to a framework.
+
+mod framework;
+mod task;
+
+use muster_api::kind::task::NodeRefusal;
+use serde::Deserialize;
+use serde_json::Value;
+
+use super::Outcome;
+use crate::client::path;
+use crate::error::CliError;
+use crate::exit;
+use crate::output::objects::{Format, document};
+use crate::output::style::Styles;
+use crate::output::table::Table;
+use crate::session::Session;
+use crate::target::{self, Named};
+
+/// `muster why`.
+#[derive(Debug, clap::Args)]
+pub(crate) struct Args {
+    /// The task, NAME or task/NAME; or framework/NAME
+    object: String,
+    /// Print what the controller says, for programs
+    #[arg(short, long, value_enum, value_name = "FORMAT")]
+    output: Option<Format>,
+}
+
+/// What `…/NAME/why` answers of tasks and of frameworks.
+#[derive(Debug, Default, Deserialize)]
+struct Answer {
+    #[serde(default)]
+    why: Vec<NodeRefusal>,
+}
+
+/// An object and what the controller says of it.
+struct Asked<'a> {
+    name: &'a str,
+    object: Value,
+    /// None: an older controller. The object's status has the essence.
+    answer: Option<Value>,
+}
+
+impl Asked<'_> {
+    /// Every node's reason, when the controller gave them.
+    fn refusals(&self) -> Option<Vec<NodeRefusal>> {
+        let answer: Option<Answer> =
+            self.answer.clone().and_then(|a| serde_json::from_value(a).ok());
+        answer.map(|a| a.why)
+    }
+}
+
+pub(crate) async fn run(args: Args, session: &mut Session) -> Outcome {
+    let named = target::one_of(&args.object, &["task", "framework"])?;
+    let asked = ask(&named, session).await?;
+    let read = |source| CliError::Answer {
+        server: session.client.server.clone(),
+        request: args.object.clone(),
+        source,
+    };
+    let (text, value) = match named.info.kind {
+        "Framework" => framework::told(&asked, &session.ui.styles).map_err(read)?,
+        _ => task::told(&asked, &session.ui.styles).map_err(read)?,
+    };
+    match args.output {
+        Some(format @ (Format::Yaml | Format::Json)) => {
+            session.ui.print(&document(&asked.answer.unwrap_or(value), format)?)?;
+        }
+        _ => session.ui.print(&text)?,
+    }
+    Ok(exit::OK)
+}
+
+async fn ask<'a>(named: &Named<'a>, session: &Session) -> Result<Asked<'a>, CliError> {
+    let name = named.name.unwrap_or_default();
+    let namespace = Some(session.namespace.as_str());
+    let object = session.client.get(named.info, namespace, name).await?;
+    let uri = why_path(named, namespace);
+    let answer = match session.client.get_json(&uri).await {
+        Ok(answer) => Some(answer),
+        Err(error) if error.is_not_found() => None,
+        Err(error) => return Err(error),
+    };
+    Ok(Asked { name, object, answer })
+}
+
+fn why_path(named: &Named<'_>, namespace: Option<&str>) -> String {
+    format!("{}/why", path(named.info, namespace, named.name))
+}
+
+/// Why each node is not offered to a framework.
+pub(crate) async fn not_offered(
+    namespace: &str,
+    name: &str,
+    session: &Session,
+) -> Result<Vec<NodeRefusal>, CliError> {
+    let named = Named { info: target::kind("framework")?, name: Some(name) };
+    let answer: Answer = session.client.get_json(&why_path(&named, Some(namespace))).await?;
+    Ok(answer.why)
+}
+
+/// Each node with the filter that refuses and what would have to change.
+pub(crate) fn refusal_table(why: &[NodeRefusal]) -> Table {
+    let mut table = Table::new(["NODE", "REFUSED BY", "WHY"]);
+    for refusal in why {
+        let node = if refusal.node.is_empty() { "(all)" } else { &refusal.node };
+        table.push([node, refusal.reason.as_str(), refusal.message.as_str()]);
+    }
+    table
+}
+
+/// The table and under it the next steps.
+fn refusals_and_hints(why: &[NodeRefusal], hints: &[String], styles: &Styles) -> String {
+    let mut text = String::new();
+    if !why.is_empty() {
+        text.push_str(&format!("\n{}", refusal_table(why).text(styles)));
+    }
+    for (i, hint) in hints.iter().enumerate() {
+        let gap = if i == 0 { "\n" } else { "" };
+        text.push_str(&format!("{gap}{} {hint}\n", styles.dim.paint("hint:")));
+    }
+    text
+}
+
+/// One of the nodes is refused for one of these.
+fn refuses(why: &[NodeRefusal], words: &[&str]) -> bool {
+    why.iter().any(|r| words.contains(&r.reason.as_str()))
+}
+
+/// Commands that help with the filters that refuse. `reach`: the field that says how far a robot may be.
+fn advice(why: &[NodeRefusal], reach: &str) -> Vec<String> {
+    let known: [(&[&str], String); 6] = [
+        (
+            &["LeaseHeld"],
+            "`muster get leases` shows who drives; when the holder ends, the lease is free".into(),
+        ),
+        (
+            &["Exhausted"],
+            "`muster top nodes` shows what is used; `muster describe node/NAME` who reserved it"
+                .into(),
+        ),
+        (
+            &["QuotaExceeded"],
+            "`muster describe quotas` shows what the namespace may have and what it has".into(),
+        ),
+        (&["NotReady"], "`muster describe node/NAME` shows when the node was last heard".into()),
+        (
+            &["OutOfRange", "OtherMap"],
+            format!(
+                "`muster get nodes` shows where the robots are; {reach} is how far they may be"
+            ),
+        ),
+        (
+            &["TooSmall", "NoSensor", "NoActuator", "WrongKind"],
+            "what a node does not have will not come by waiting: `muster get nodes -o wide`".into(),
+        ),
+    ];
+    // What will not come by waiting matters only when no node is merely busy.
+    let busy =
+        refuses(why, &["LeaseHeld", "Exhausted", "NotReady", "OutOfRange", "OtherMap", "Cordoned"]);
+    known
+        .into_iter()
+        .filter(|(words, _)| refuses(why, words) && !(busy && words.contains(&"TooSmall")))
+        .map(|(_, text)| text)
+        .collect()
+}
