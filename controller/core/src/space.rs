@@ -11,7 +11,7 @@ use std::hash::{BuildHasherDefault, Hasher};
 use nalgebra::Point3;
 
 /// Side of a cell, metres. Radii of work in a building are 5 to 50 m: a query then touches about ten cells, and a cell of
-/// a busy hall (one robot per 100 m²) holds four robots. With sides of 10 m and 25 m the benchmark `offers` is slower.
+/// a busy hall (one robot per 100 m²) holds four robots. With sides of 10 m the benchmark `offers` is slower.
 const CELL: f64 = 20.0;
 
 /// Room for the robots of the first rings, so that a query allocates once.
