@@ -94,7 +94,7 @@ impl Base {
 fn choose(places: &[Place]) -> usize {
     let given = places.iter().take(2).position(|place| place.delegated && !place.tree_root);
     let own = || places.first().filter(|own| own.alone && !own.tree_root).map(|_| 0);
-    given.or_else(own).unwrap_or(places.len().saturating_sub(1))
+    given.or_else(own).unwrap_or_else(|| places.len().saturating_sub(1))
 }
 
 fn look(dir: &Path, top: bool) -> Place {
