@@ -1,5 +1,5 @@
 //! Compiles the server side of the gRPC services, without a `protoc` on the machine. The messages are
-//! `muster_api`'s.
+//! `muster_api`'s. The client's side is compiled as well, to a file of its own that only tests include.
 
 use std::path::Path;
 
@@ -7,15 +7,26 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let root = Path::new("../api/proto");
     println!("cargo:rerun-if-changed=../api/proto");
     let package = |name: &str| root.join(format!("muster/{name}/v1/{name}.proto"));
-    let files = protox::compile([package("agent"), package("framework")], [root])?;
+    let files = || protox::compile([package("agent"), package("framework")], [root]);
+    let messages = "::muster_api::wire::agent::v1";
+    let framework = "::muster_api::wire::framework::v1";
+    let client = Path::new(&std::env::var("OUT_DIR")?).join("client");
+    std::fs::create_dir_all(&client)?;
+    tonic_prost_build::configure()
+        .build_server(false)
+        .build_transport(false)
+        .extern_path(".muster.agent.v1", messages)
+        .extern_path(".muster.framework.v1", framework)
+        .out_dir(client)
+        .compile_fds(files()?)?;
     tonic_prost_build::configure()
         .build_client(false)
         .server_mod_attribute(
             ".",
             "#[allow(clippy::allow_attributes_without_reason, reason = \"generated\")]",
         )
-        .extern_path(".muster.agent.v1", "::muster_api::wire::agent::v1")
-        .extern_path(".muster.framework.v1", "::muster_api::wire::framework::v1")
-        .compile_fds(files)?;
+        .extern_path(".muster.agent.v1", messages)
+        .extern_path(".muster.framework.v1", framework)
+        .compile_fds(files()?)?;
     Ok(())
 }

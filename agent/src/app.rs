@@ -27,6 +27,7 @@ use crate::driver::{Shared, chain};
 use crate::durable::FileError;
 use crate::executor::desk::Desks;
 use crate::executor::work::WorkRuntime;
+use crate::footprint;
 use crate::link::join::{self, Credentials, JoinError};
 use crate::link::session::{Command, Link};
 use crate::link::token::{Token, TokenError};
@@ -176,19 +177,31 @@ pub async fn serve(
     let (kind, address) = settle(&config, &mut identity)?;
     let Some(name) = identity.node.clone() else { return Err(AgentError::Missing("--name")) };
     let credentials = Credentials::at(&config.data_dir);
-    if !credentials.exist() {
-        let token: Token =
-            config.token.as_deref().ok_or(AgentError::Missing("--token"))?.parse()?;
-        join::join(&address, &token, &name, kind, &credentials).await?;
-        tracing::info!(node = %name, controller = %address, "joined");
+    let token: Option<Token> = config.token.as_deref().map(str::parse).transpose()?;
+    match token {
+        None if !credentials.exist() => return Err(AgentError::Missing("--token")),
+        Some(token) if !credentials.exist() || !credentials.came_by(&token) => {
+            match join::join(&address, &token, &name, kind, &credentials).await {
+                Ok(()) => tracing::info!(node = %name, controller = %address, "joined"),
+                // A token that was left in a start script must not keep a joined robot out.
+                Err(error) if credentials.exist() => {
+                    tracing::warn!(
+                        error = chain(&error),
+                        "going on with the credentials of before"
+                    );
+                }
+                Err(error) => return Err(error.into()),
+            }
+        }
+        _ => {}
     }
     // Only now: a join that failed must not tie the directory to a name.
     identity.write(&config.data_dir)?;
-
     config.declared.keep(&config.data_dir)?;
     if !config.remembered.is_empty() {
         tracing::info!(flags = config.remembered.join(" "), "not given now; kept as given last");
     }
+
     let enforcer = enforcer(&identity.id).await;
     let enforced = match &enforcer {
         Ok(kernel) => Ok(Enforced {
@@ -257,13 +270,19 @@ pub async fn serve(
     };
     let engine = tokio::spawn(async move { docker.run().await });
     let session = tokio::spawn(link.run(node));
+    let mut settled = false;
     loop {
         // Cancel-safe: receivers, a join and a token.
         tokio::select! {
             () = shutdown.cancelled() => break,
             command = received.recv() => match command {
                 Some(Command::Assign(assignments)) => supervisor.assign(assignments),
-                Some(Command::Contact) => supervisor.tick(),
+                Some(Command::Contact) => {
+                    supervisor.tick();
+                    if !std::mem::replace(&mut settled, true) {
+                        footprint::give_back();
+                    }
+                }
                 // The link never ends by itself: it panicked. The tasks go on without it.
                 None => {
                     tracing::error!("the link is gone; start this agent again");

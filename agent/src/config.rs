@@ -216,10 +216,9 @@ impl Args {
         let actuators = functions("--ar-res", &declared.ar_res)?;
         let sensors = functions("--sr-res", &declared.sr_res)?;
         if kind == Some(Kind::Cloud) && !(actuators.is_empty() && sensors.is_empty()) {
-            return Err(ConfigError::Field {
-                field: "--kind",
-                reason: "a cloud node has no sensors and no actuators; use --kind robot".to_owned(),
-            });
+            let reason =
+                "a cloud node has no sensors and no actuators; use --kind robot".to_owned();
+            return Err(ConfigError::Field { field: "--kind", reason });
         }
         let name = self.name.or(file.name);
         let socket = self.docker_socket.or(file.docker_socket);

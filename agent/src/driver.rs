@@ -54,8 +54,8 @@ pub(crate) struct Shared {
 
 impl Shared {
     /// Which runtime runs a task.
-    fn runtime(&self, kind: Kind) -> &Arc<dyn Runtime> {
-        match kind {
+    fn runtime(&self, record: &Record) -> &Arc<dyn Runtime> {
+        match Kind::of(&record.assignment.spec) {
             Kind::Process => &self.process,
             Kind::Docker => &self.docker,
             Kind::Work => &self.works,
@@ -78,9 +78,8 @@ impl Shared {
     }
 
     fn enrol(&self, record: &Record) {
-        let kind = Kind::of(&record.assignment.spec);
-        if kind != Kind::Work {
-            let room = (Arc::clone(self.runtime(kind)), self.launch(record).limits);
+        if Kind::of(&record.assignment.spec) != Kind::Work {
+            let room = (Arc::clone(self.runtime(record)), self.launch(record).limits);
             self.desks.enrol(&record.assignment, &record.workload, room);
         }
     }
@@ -133,8 +132,22 @@ pub(crate) enum Begin {
     New(TaskUid, Box<Assignment>, Desired),
     /// A task whose assignment cannot be read, and why.
     Unreadable(TaskUid, Box<Assignment>, String),
-    /// A task of an earlier life of the agent.
-    Restored(Box<Record>),
+    /// A task of an earlier life of the agent, and the first things to do about it.
+    Restored(Box<Record>, Response),
+}
+
+impl Begin {
+    /// Takes up a task of an earlier life of the agent, and shows its report: the first Hello must
+    /// name everything of which a process may live, however slow the disk is.
+    pub(crate) fn restore(shared: &Shared, mut record: Record) -> Begin {
+        let same_boot = record.boot_id == shared.boot_id;
+        record.boot_id.clone_from(&shared.boot_id);
+        let response = record.workload.restored(same_boot, context(shared));
+        if response.effects.contains(&Effect::Publish) {
+            publish(shared, &record);
+        }
+        Begin::Restored(Box::new(record), response)
+    }
 }
 
 pub(crate) async fn drive(
@@ -153,16 +166,10 @@ pub(crate) async fn drive(
             let (workload, response) = Workload::unreadable(uid, why, context);
             (Record::new(&shared.boot_id, *assignment, workload), response)
         }
-        Begin::Restored(record) => {
-            let mut record = *record;
-            let same_boot = record.boot_id == shared.boot_id;
-            record.boot_id.clone_from(&shared.boot_id);
-            let response = record.workload.restored(same_boot, context);
-            (record, response)
-        }
+        Begin::Restored(record, response) => (*record, response),
     };
     shared.enrol(&record);
-    let runtime = Arc::clone(shared.runtime(Kind::of(&record.assignment.spec)));
+    let runtime = Arc::clone(shared.runtime(&record));
     let mut driver = Driver {
         shared,
         runtime,
@@ -176,6 +183,13 @@ pub(crate) async fn drive(
     };
     driver.carry_out(response).await;
     driver.run().await;
+}
+
+fn publish(shared: &Shared, record: &Record) {
+    let (workload, runtime) = (&record.workload, shared.runtime(record));
+    let reserved = record.assignment.spec.resources.memory.map_or(0, |memory| memory.0);
+    let board = &shared.board;
+    board.publish(&workload.uid, &workload.report, workload.attempt, runtime, reserved);
 }
 
 fn context(shared: &Shared) -> Context {
@@ -243,7 +257,7 @@ impl Driver {
         for effect in response.effects {
             match effect {
                 Effect::Persist => self.persist().await,
-                Effect::Publish => self.publish(),
+                Effect::Publish => publish(&self.shared, &self.record),
                 Effect::WakeAt(at) => {
                     self.wakes.insert(at);
                 }
@@ -344,13 +358,6 @@ impl Driver {
 
     fn launch(&self) -> Launch {
         self.shared.launch(&self.record)
-    }
-
-    fn publish(&self) {
-        let workload = &self.record.workload;
-        let reserved = self.record.assignment.spec.resources.memory.map_or(0, |memory| memory.0);
-        let board = &self.shared.board;
-        board.publish(&workload.uid, &workload.report, workload.attempt, &self.runtime, reserved);
     }
 
     async fn persist(&mut self) {
@@ -462,6 +469,10 @@ mod tests {
 
     fn bench(dir: tempfile::TempDir, fake: Arc<Fake>, begin: Begin) -> Bench {
         let shared = shared(&dir, &fake);
+        run(dir, fake, shared, begin)
+    }
+
+    fn run(dir: tempfile::TempDir, fake: Arc<Fake>, shared: Arc<Shared>, begin: Begin) -> Bench {
         let (inbox, messages) = mpsc::unbounded_channel();
         let driver = tokio::spawn(drive(Arc::clone(&shared), begin, messages));
         Bench { dir, fake, shared, inbox, driver }
@@ -515,7 +526,12 @@ mod tests {
         let fake = Arc::new(Fake::default());
         fake.finds.lock().unwrap().push_back(Observed::Ended(exit(0)));
         let record = Checkpoint::open(dir.path()).unwrap().read_all().unwrap().remove(0);
-        let bench = super::tests::bench(dir, fake, Begin::Restored(Box::new(record)));
+        let shared = shared(&dir, &fake);
+        let begin = Begin::restore(&shared, record);
+        let told: Vec<Phase> =
+            shared.board.reports().iter().map(|(_, r, _)| r.content.phase).collect();
+        assert_eq!(told, [Phase::Running], "the first Hello names what may live");
+        let bench = run(dir, fake, shared, begin);
         let end = bench.report(|r| r.content.phase.is_terminal()).await;
         assert_eq!((end.content.phase, end.content.attempt), (Phase::Succeeded, 1));
         assert_eq!(bench.fake.asked(), ["find 1"]);

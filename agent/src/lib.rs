@@ -15,6 +15,7 @@
 //! | `checkpoint`, `durable` | what survives the agent |
 //! | `board` | what tasks show of themselves |
 //! | `executor` | tasks that run other tasks, over a socket of their own |
+//! | `footprint` | memory that is given back after the start |
 //! | `contact` | when the controller was last heard, for the shims too |
 //! | `link` | joining, the session, logs on request |
 //! | `node`, `capacity`, `position` | what this node is, has, and where it is |
@@ -31,6 +32,7 @@ mod declared;
 mod driver;
 mod durable;
 mod executor;
+mod footprint;
 mod link;
 mod node;
 mod position;

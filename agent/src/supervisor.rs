@@ -40,7 +40,7 @@ impl Supervisor {
         for record in records {
             let uid = record.workload.uid.clone();
             let forgotten = record.workload.forgotten;
-            self.start(uid, forgotten, Begin::Restored(Box::new(record)));
+            self.start(uid, forgotten, Begin::restore(&self.shared, record));
         }
     }
 

@@ -120,10 +120,13 @@ fn everything_goes_on_without_a_controller() {
     controller.set_away(false);
     assert_eq!(controller.wait_end("end").exit_code, Some(9));
     assert!(lives(pid));
-    // What a complete set does not name is ended and forgotten.
+    // What a complete set does not name is ended; its end is told, and then it may be forgotten.
     controller.unassign("keep");
     controller.set_away(true);
     controller.set_away(false);
+    assert_eq!(controller.wait_end("keep").reason, "Stopped");
+    assert!(agent.task_dir("keep").exists());
+    controller.release("keep");
     until("the task to go", || (!agent.task_dir("keep").exists()).then_some(()));
     assert!(!lives(pid));
 }

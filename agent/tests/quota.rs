@@ -1,7 +1,5 @@
 //! Quotas, measured from the kernel. Needs root and cgroups.
 
-#![expect(clippy::unwrap_used, reason = "tests")]
-
 mod common;
 
 use std::time::{Duration, Instant};

@@ -42,6 +42,8 @@ pub struct Condition {
 
 /// The node takes part: its agent has been heard within the detection time.
 pub const READY: &str = "Ready";
+/// A person confirmed that the node is off or that its processes are gone; what it held was given free.
+pub const FENCED: &str = "Fenced";
 /// Quotas of tasks are enforced by the kernel on this node (invariant 7).
 pub const QUOTAS_ENFORCED: &str = "QuotasEnforced";
 

@@ -79,7 +79,7 @@ pub(crate) enum Command {
     Uncordon(cordon::Args),
     /// Cordon a node and end the tasks on it
     Drain(drain::Args),
-    /// Register nodes
+    /// Register nodes, and fence those that are lost
     #[command(subcommand)]
     Node(node::Command),
     /// Tokens with which agents join
@@ -185,6 +185,7 @@ mod tests {
             "muster cordon a b",
             "muster drain a --grace-period 5 --timeout 2m",
             "muster node register r1 --kind robot --speed 0.5 --label area=lab",
+            "muster node fence r1 --reason off --by ada --yes",
             "muster token create --ttl 2h --node r1 --uses 3",
             "muster token list",
             "muster token delete abc",
@@ -209,6 +210,7 @@ mod tests {
             "muster wait task/x --timeout 60",
             "muster delete tasks --now --grace-period 3",
             "muster node register r1 --kind plane",
+            "muster node fence r1 --yes",
             "muster plan",
         ] {
             assert_eq!(

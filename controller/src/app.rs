@@ -24,6 +24,7 @@ use tokio_util::task::TaskTracker;
 use crate::config::Config;
 use crate::context::{Clock as _, Context, Live, SystemClock};
 use crate::events::{self, Happening, Recorder};
+use crate::kubeconfig::KubeconfigError;
 use crate::pki::{Pki, PkiError};
 use crate::serve::Server;
 use crate::session::agents::Agents;
@@ -68,6 +69,9 @@ pub enum AppError {
     /// Certificates.
     #[error(transparent)]
     Pki(#[from] PkiError),
+    /// The admin's kubeconfig.
+    #[error(transparent)]
+    Kubeconfig(#[from] KubeconfigError),
     /// The store.
     #[error(transparent)]
     Open(#[from] OpenError),
@@ -133,7 +137,8 @@ pub async fn start(config: Config) -> Result<Running, AppError> {
     let writer = tokio::spawn(writer.run(stop_writer.clone()));
     rest::namespace::bootstrap(&context).await.map_err(AppError::Bootstrap)?;
     let admin = context.pki.admin(now)?;
-    kubeconfig::write(&context.config.kubeconfig, &context.url(), context.pki.ca(), &admin)?;
+    let (file, asked) = (&context.config.kubeconfig, context.config.kubeconfig_asked);
+    kubeconfig::write(file, asked, &context.url(), context.pki.ca(), &admin)?;
 
     let background = TaskTracker::new();
     let agents = spawn_background(&context, &background, happenings);

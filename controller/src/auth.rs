@@ -5,7 +5,7 @@
 
 use rustls::pki_types::CertificateDer;
 
-use crate::pki::{ADMINS, NODE_PREFIX, NODES};
+use crate::pki::{ADMINS, NODE_PREFIX, NODES, hex};
 use crate::rest::path::{Target, Verb};
 
 /// Who is at the other end of a connection.
@@ -20,6 +20,9 @@ pub enum Identity {
     Node {
         /// The node's name.
         name: String,
+        /// SHA-256 of the certificate's public key, hex. The Node says which keys are its agent's
+        /// (see `rest::enrol`), so that a name alone admits nobody.
+        key: String,
     },
     /// Somebody with a certificate of ours that says neither.
     User {
@@ -51,7 +54,8 @@ impl Identity {
         }
         match name.strip_prefix(NODE_PREFIX) {
             Some(node) if groups.iter().any(|group| group == NODES) => {
-                Self::Node { name: node.to_owned() }
+                let key = ring::digest::digest(&ring::digest::SHA256, certificate.public_key().raw);
+                Self::Node { name: node.to_owned(), key: hex(key.as_ref()) }
             }
             _ => Self::User { name, groups },
         }
@@ -62,7 +66,7 @@ impl Identity {
     pub fn name(&self) -> String {
         match self {
             Self::Admin { name } | Self::User { name, .. } => name.clone(),
-            Self::Node { name } => format!("{NODE_PREFIX}{name}"),
+            Self::Node { name, .. } => format!("{NODE_PREFIX}{name}"),
             Self::Anonymous => "anonymous".to_owned(),
         }
     }
@@ -85,7 +89,7 @@ pub(crate) fn permits(identity: &Identity, verb: Verb, target: &Target) -> Permi
         _ if open => Permission::Granted,
         Identity::Admin { .. } => Permission::Granted,
         Identity::Anonymous => Permission::WhoAreYou,
-        Identity::Node { name } => match target {
+        Identity::Node { name, .. } => match target {
             Target::Objects(object)
                 if verb == Verb::Get
                     && object.entry.resource.as_str() == "nodes"

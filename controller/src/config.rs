@@ -12,7 +12,8 @@ pub struct Args {
     /// The address of the one port for REST and agents
     #[arg(long, value_name = "ADDR", default_value = "127.0.0.1:7443")]
     pub listen: SocketAddr,
-    /// Where the admin's kubeconfig is written [default: ~/.muster/config]
+    /// Where the admin's kubeconfig is written, whatever is there [default: ~/.muster/config, unless
+    /// that is another cluster's]
     #[arg(long, value_name = "FILE")]
     pub kubeconfig: Option<PathBuf>,
     /// A name or address under which agents reach this controller; may be given several times
@@ -29,6 +30,8 @@ pub struct Config {
     pub listen: SocketAddr,
     /// Where the admin's kubeconfig is written.
     pub kubeconfig: PathBuf,
+    /// Somebody named that file: it is replaced, whatever it says.
+    pub kubeconfig_asked: bool,
     /// Names and addresses for the certificate and for join commands, best first.
     pub advertise: Vec<String>,
 }
@@ -40,6 +43,7 @@ impl From<Args> for Config {
         Self {
             data_dir: args.data_dir.unwrap_or_else(|| own.join("controller")),
             listen: args.listen,
+            kubeconfig_asked: args.kubeconfig.is_some(),
             kubeconfig: args.kubeconfig.unwrap_or_else(|| own.join("config")),
             advertise: args.advertise,
         }

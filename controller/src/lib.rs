@@ -19,7 +19,7 @@ pub mod auth;
 pub mod config;
 pub mod context;
 pub mod events;
-mod kubeconfig;
+pub mod kubeconfig;
 mod metrics;
 pub mod objects;
 pub mod pki;

@@ -111,6 +111,18 @@ pub fn release_lease(store: &Store, name: &str, uid: &str) -> Option<Op> {
     Some(replace(&stored, &lease))
 }
 
+/// The tasks that hold resources of a node, in the order of their names.
+#[must_use]
+pub fn tasks_holding(store: &Store, node: &str) -> Vec<(Arc<Stored>, Task)> {
+    let placed = store.list(TASKS, None).items.into_iter().filter(|s| s.mentions(node));
+    let read = placed.filter_map(|stored| read::<Task>(&stored).map(|task| (stored, task)));
+    read.filter(|(_, task)| {
+        let status = task.status.as_ref();
+        status.is_some_and(|s| s.phase.holds_node() && s.node.as_deref() == Some(node))
+    })
+    .collect()
+}
+
 /// Fields that the server owns, for objects that the controller itself creates.
 pub fn stamp_new(
     metadata: &mut k8s_openapi::apimachinery::pkg::apis::meta::v1::ObjectMeta,

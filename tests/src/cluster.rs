@@ -237,7 +237,8 @@ impl Cluster {
         self.node_ready(&name).await;
     }
 
-    fn spawn_agent(&mut self, name: &str, token: Option<&str>) {
+    /// Starts an agent's process, and does not wait for its node.
+    pub fn spawn_agent(&mut self, name: &str, token: Option<&str>) {
         let options = self.agents[name].options.clone();
         let mut command = Command::new(binary("muster-agent"));
         command

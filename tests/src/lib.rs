@@ -5,6 +5,7 @@
 //! |---|---|
 //! | [`cluster`] | starting, killing and restarting the daemons; the API of the cluster |
 //! | [`wait`] | waiting for what a watch or the kernel shows, with a generous deadline |
+//! | [`puppet`] | frameworks on the Python SDK, one process each |
 //! | [`docker`] | an image without a registry |
 //! | [`kernel`] | what the kernel says: processes, start times, cgroups |
 //!
@@ -13,6 +14,8 @@
 pub mod cluster;
 pub mod docker;
 pub mod kernel;
+pub mod puppet;
 pub mod wait;
 
 pub use cluster::{AgentOptions, Cluster};
+pub use puppet::Puppet;

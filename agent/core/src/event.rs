@@ -20,6 +20,9 @@ pub struct Failure {
 pub enum Event {
     /// The controller wants this now (whole).
     Assigned(Desired),
+    /// It is not among what this node should have: it ends, and its end is told until the controller
+    /// forgets it.
+    Unassigned,
     /// The controller wants it ended and forgotten, or has recorded its end.
     Forgotten,
     /// Time passed, or contact came back.

@@ -69,7 +69,7 @@ pub fn plan(assignments: Assignments, known: &BTreeMap<TaskUid, bool>) -> Plan {
                 || assignments.released.contains(uid)
         };
         for uid in known.keys().filter(|uid| !named(uid)) {
-            plan.steps.push(Step::Tell(uid.clone(), Event::Forgotten));
+            plan.steps.push(Step::Tell(uid.clone(), Event::Unassigned));
         }
     }
     for (uid, why) in assignments.unreadable {
@@ -116,8 +116,8 @@ mod tests {
         assert_eq!(
             plan(wanted, &known).steps,
             [
-                Step::Tell(uid("a"), Event::Forgotten),
-                Step::Tell(uid("c"), Event::Forgotten),
+                Step::Tell(uid("a"), Event::Unassigned),
+                Step::Tell(uid("c"), Event::Unassigned),
                 Step::Tell(uid("b"), Event::Assigned(desired())),
                 Step::Create(uid("d"), desired()),
             ]

@@ -14,7 +14,7 @@
 use muster_api::id::TaskUid;
 use serde::{Deserialize, Serialize};
 
-use crate::desired::{Desired, RestartPolicy};
+use crate::desired::{Desired, RestartPolicy, StopOrder};
 pub use crate::event::{Context, Effect, Event, Failure, Outcome, Response};
 use crate::observed::{End, Exit, Loss, Observed, Started};
 use crate::report::{Content, Phase, Reason, Report, explain};
@@ -221,6 +221,7 @@ impl Workload {
         let mut effects = Vec::new();
         match event {
             Event::Assigned(desired) => self.on_assigned(desired, context, &mut effects),
+            Event::Unassigned => self.on_unassigned(context, &mut effects),
             Event::Forgotten => {
                 self.forgotten = true;
                 self.end_if_wanted(context, &mut effects);
@@ -274,6 +275,16 @@ impl Workload {
         let stop = desired.stop.clone().or_else(|| self.desired.stop.clone());
         self.desired = Desired { stop, ..desired };
         if sooner {
+            self.end_if_wanted(context, effects);
+        }
+    }
+
+    /// The controller gives this node's resources to somebody else only when it was told that nothing
+    /// is left: the end must be heard before the task may be forgotten, so it waits for the release.
+    fn on_unassigned(&mut self, context: Context, effects: &mut Vec<Effect>) {
+        if self.desired.stop.is_none() {
+            let reason = "no longer assigned".to_owned();
+            self.desired.stop = Some(StopOrder { grace_ms: self.desired.grace_ms, reason });
             self.end_if_wanted(context, effects);
         }
     }

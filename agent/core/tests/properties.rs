@@ -34,6 +34,7 @@ enum Action {
     Ends(i32),
     Pass(u64),
     Stop(u64),
+    Unassign,
     Forget,
     Wish(RestartPolicy),
 }
@@ -51,6 +52,7 @@ fn action() -> impl Strategy<Value = Action> {
         4 => prop_oneof![Just(0), Just(1)].prop_map(Action::Ends),
         4 => (1..400_000_u64).prop_map(Action::Pass),
         1 => (0..20_000_u64).prop_map(Action::Stop),
+        1 => Just(Action::Unassign),
         1 => Just(Action::Forget),
         1 => policy().prop_map(Action::Wish),
     ]
@@ -340,6 +342,7 @@ impl World {
                 self.desired.stop = Some(StopOrder { grace_ms, reason: "Deleted".to_owned() });
                 self.handle(Event::Assigned(self.desired.clone()));
             }
+            Action::Unassign => self.handle(Event::Unassigned),
             Action::Forget => self.handle(Event::Forgotten),
             Action::Wish(restart) => {
                 self.desired.restart = restart;
@@ -384,6 +387,23 @@ proptest! {
         world.act(Action::Forget);
         world.settle();
         prop_assert!(world.dropped, "a forgotten task stays");
+    }
+
+    #[test]
+    fn a_task_that_is_no_longer_assigned_tells_its_end_before_it_goes(
+        policy in policy(),
+        fetch in fetch(),
+    ) {
+        let mut world = World::new(policy, fetch);
+        world.act(Action::Answer(0));
+        world.act(Action::Unassign);
+        world.settle();
+        prop_assert_eq!(world.live(), 0);
+        prop_assert!(!world.dropped, "forgotten before anybody asked for that");
+        prop_assert!(world.told.as_ref().is_some_and(|told| told.content.phase.is_terminal()));
+        world.act(Action::Forget);
+        world.settle();
+        prop_assert!(world.dropped, "its end was heard");
     }
 
     #[test]

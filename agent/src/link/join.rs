@@ -1,4 +1,4 @@
-//! From a token to a certificate, once. The key is made here and never leaves.
+//! From a token to a certificate, once a token. The key is made here and never leaves.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -95,6 +95,12 @@ impl Credentials {
         self.dir.join("node.crt").exists()
     }
 
+    /// Whether they came by this token. Another one is a wish to join anew: the node was deleted, or
+    /// registered again.
+    pub(crate) fn came_by(&self, token: &Token) -> bool {
+        std::fs::read_to_string(self.dir.join("token-id")).is_ok_and(|id| id == token.id())
+    }
+
     /// The session's TLS.
     pub(crate) fn tls(&self) -> Result<ClientConfig, JoinError> {
         let read = |name: &str| {
@@ -104,11 +110,22 @@ impl Credentials {
         Ok(tls::mutual(&read("ca.crt")?, &read("node.crt")?, &read("node.key")?)?)
     }
 
-    fn write(&self, key: &str, answer: &JoinAnswer) -> Result<(), FileError> {
+    fn write(&self, key: &str, answer: &JoinAnswer, token: &Token) -> Result<(), FileError> {
         std::fs::create_dir_all(&self.dir).map_err(FileError::at("make", &self.dir))?;
-        for (name, text) in
-            [("node.key", key), ("ca.crt", &answer.ca), ("node.crt", &answer.certificate)]
-        {
+        // Those of an earlier join end first: a key never stands beside another's certificate.
+        let certificate = self.dir.join("node.crt");
+        match std::fs::remove_file(&certificate) {
+            Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
+                return Err(FileError::at("remove", &certificate)(error));
+            }
+            _ => {}
+        }
+        for (name, text) in [
+            ("node.key", key),
+            ("ca.crt", &answer.ca),
+            ("token-id", token.id()),
+            ("node.crt", &answer.certificate),
+        ] {
             durable::write(&self.dir.join(name), text.as_bytes(), 0o600, Keep::PowerCut)?;
         }
         Ok(())
@@ -145,7 +162,7 @@ pub(crate) async fn join(
     }
     let answer: JoinAnswer =
         serde_json::from_slice(&body).map_err(|error| JoinError::Http(error.into()))?;
-    credentials.write(&key.serialize_pem(), &answer)?;
+    credentials.write(&key.serialize_pem(), &answer, token)?;
     Ok(())
 }
 

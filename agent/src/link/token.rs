@@ -12,6 +12,13 @@ pub(crate) struct Token {
     pub(crate) ca_hash: [u8; 32],
 }
 
+impl Token {
+    /// Its public part, by which `muster token list` shows it.
+    pub(crate) fn id(&self) -> &str {
+        self.text.split('.').nth(1).unwrap_or_default()
+    }
+}
+
 impl fmt::Debug for Token {
     /// Not the secret: this ends up in logs.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -53,6 +60,7 @@ mod tests {
         let text = format!("muster1.a.b.{}", "0f".repeat(32));
         let token: Token = text.parse().unwrap();
         assert_eq!(token.ca_hash, [0x0f; 32]);
+        assert_eq!(token.id(), "a");
         assert!(!format!("{token:?}").contains(".b."));
         let zz = format!("muster1.a.b.{}", "zz".repeat(32));
         for bad in ["", "muster1.a.b.c", "muster2.a.b", &zz] {

@@ -97,7 +97,7 @@ pub struct NodeStatus {
     /// A coarse checkpoint of where the robot is.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub pose: Option<Pose>,
-    /// Facts about the node; `Ready` is the controller's, the others are the agent's.
+    /// Facts about the node; `Ready` and `Fenced` are the controller's, the others are the agent's.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub conditions: Vec<Condition>,
     /// How tasks can be run there.
@@ -109,6 +109,10 @@ pub struct NodeStatus {
     /// The life of the agent that reported all this.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub incarnation: Option<Incarnation>,
+    /// SHA-256 of the public keys with which an agent may speak for this node, newest first; none: no
+    /// agent has joined.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub agent_keys: Vec<String>,
     /// The agent's version.
     #[serde(skip_serializing_if = "String::is_empty")]
     pub agent_version: String,

@@ -207,7 +207,7 @@ mod tests {
         assert_eq!(spec.radius, Some(20.0));
         assert_eq!(spec.filter.minimum.cpu, MilliCpu(500));
         assert_eq!(spec.filter.on, NodeChoice::Robot);
-        assert_eq!(spec.failover_timeout.0.to_string(), "2500ms");
+        assert_eq!(spec.failover_timeout.0.to_string(), "2s500ms");
         let bad = wire::Subscribe {
             filter: Some(wire::Filter {
                 sensors: vec!["kinect".into()],

@@ -6,6 +6,7 @@ pub(crate) mod cordon;
 pub(crate) mod delete;
 pub(crate) mod describe;
 pub(crate) mod drain;
+pub(crate) mod fence;
 pub(crate) mod get;
 pub(crate) mod gone;
 pub(crate) mod local;

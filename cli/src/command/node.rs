@@ -1,10 +1,10 @@
-//! `muster node`: nodes before their agents have joined.
+//! `muster node`: nodes before their agents have joined, and after they are lost.
 
 use muster_api::kind;
 use serde_json::{Map, Value, json};
 
-use super::Outcome;
 use super::token::{Terms, join_command, make, secret};
+use super::{Outcome, fence};
 use crate::args::pair;
 use crate::client::Mode;
 use crate::error::{Class, CliError};
@@ -17,6 +17,8 @@ use crate::target;
 pub(crate) enum Command {
     /// Create a Node and print the command with which its agent joins
     Register(RegisterArgs),
+    /// Confirm that a node is off: its tasks end, and what they held is free
+    Fence(fence::Args),
 }
 
 /// `muster node register`.
@@ -55,6 +57,7 @@ impl NodeKind {
 pub(crate) async fn run(command: Command, session: &mut Session) -> Outcome {
     match command {
         Command::Register(args) => register(args, session).await,
+        Command::Fence(args) => fence::run(args, session).await,
     }
 }
 

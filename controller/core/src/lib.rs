@@ -18,6 +18,7 @@
 //! | [`fairness`] | namespaces' shares and quotas |
 //! | [`recent`] | one allocation for what many nodes or tasks have in common |
 //! | [`node_health`] | when a node counts as lost |
+//! | [`stray`] | what an agent runs and should not |
 //! | [`report`] | typed reasons, with the words people read |
 #![deny(missing_docs)]
 
@@ -32,3 +33,4 @@ pub mod recent;
 pub mod report;
 pub mod schedule;
 pub mod space;
+pub mod stray;

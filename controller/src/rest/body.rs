@@ -3,6 +3,8 @@
 use axum::body::Body;
 use bytes::Bytes;
 use http::{HeaderMap, StatusCode, header};
+use muster_api::validate::Violations;
+use serde::de::DeserializeOwned;
 use serde_json::Value;
 
 use super::failure::Failure;
@@ -58,6 +60,21 @@ pub(super) async fn optional_json(headers: &HeaderMap, body: Body) -> Result<Val
         return Err(unsupported(&found, "application/json"));
     }
     parse(&bytes)
+}
+
+/// A body as what it should be; 422 with the field's path, for unknown fields too.
+pub(super) fn typed<T: DeserializeOwned>(what: &str, body: Value) -> Result<T, Failure> {
+    serde_path_to_error::deserialize(body).map_err(|error| {
+        let mut violations = Violations::new();
+        let unknown = error.inner().to_string();
+        match unknown.split_once(", expected") {
+            Some((_, known)) if unknown.starts_with("unknown field") => violations
+                .not_supported(error.path().to_string(), "is not a field")
+                .suggest(format!("expected{known}")),
+            _ => drop(violations.invalid(error.path().to_string(), unknown)),
+        }
+        Failure::invalid_body(what, &violations)
+    })
 }
 
 pub(super) fn parse(bytes: &[u8]) -> Result<Value, Failure> {

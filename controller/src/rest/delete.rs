@@ -2,13 +2,15 @@
 //!
 //! An object stays, with `deletionTimestamp`, while it has finalizers, and a Task also while it may have processes: the
 //! reconciler removes it once the agent has confirmed that they are gone. Even a grace of 0 only tells the agent to hurry:
-//! removing the object would free what the processes still use.
+//! removing the object would free what the processes still use. For the same reason a Node that tasks hold is not
+//! deleted at all.
 
 use std::sync::Arc;
 
 use axum::response::Response;
 use http::StatusCode;
 use jiff::{SignedDuration, Timestamp};
+use muster_api::name::NodeName;
 use muster_api::phase::TaskPhase;
 use serde::Deserialize;
 use serde_json::{Value, json};
@@ -18,6 +20,7 @@ use super::registry::Entry;
 use super::selector::Selection;
 use super::{Answer, Call, body, failure::Failure, metadata};
 use crate::context::Context;
+use crate::objects;
 use crate::store::{Key, Precondition, Resource, Store, StoreError, Stored};
 
 /// What a task gets that says nothing about it, s.
@@ -163,8 +166,17 @@ async fn end(
         ))
         .about(entry, name));
     }
+    // A node must not come back, nor take a task from a session that begins, while this is decided.
+    let live = context.live().filter(|_| entry.info.kind == "Node");
+    let _no_session_begins = match live {
+        Some(live) => Some(live.sessions.hold_back().await),
+        None => None,
+    };
     loop {
         let present = context.store.get(key).ok_or_else(|| Failure::not_found(entry, name))?;
+        if entry.info.kind == "Node" {
+            refuse_in_use(context, entry, name)?;
+        }
         check(entry, &present, &options.preconditions)?;
         let object = present.value();
         let finalizer = finalizer(options);
@@ -186,11 +198,37 @@ async fn end(
             }
         };
         match ended {
-            Ok(ended) => return Ok(ended),
+            Ok(ended) => {
+                // Its agent's session ends at once, and its certificate admits it no more.
+                if let (Some(live), Ok(name)) = (live, NodeName::new(name)) {
+                    live.sessions.kick(&name);
+                }
+                return Ok(ended);
+            }
             Err(StoreError::Conflict { .. }) => {}
             Err(error) => return Err(Failure::of_store(entry, name, &error)),
         }
     }
+}
+
+/// 409 while tasks hold resources of a node: without the object nobody could end them.
+fn refuse_in_use(context: &Context, entry: &Entry, node: &str) -> Result<(), Failure> {
+    let holding = objects::tasks_holding(&context.store, node);
+    if holding.is_empty() {
+        return Ok(());
+    }
+    let names: Vec<String> = holding
+        .iter()
+        .map(|(stored, _)| {
+            format!("{}/{}", stored.key.namespace().unwrap_or_default(), stored.key.name)
+        })
+        .collect();
+    let why = format!(
+        "node {node} is in use, {} on it: {}; end them first (`muster drain {node}`, or `muster node fence {node}` when the node is off)",
+        if names.len() == 1 { "a task is" } else { "tasks are" },
+        names.join(", ")
+    );
+    Err(Failure::new(StatusCode::CONFLICT, "NodeInUse", why).about(entry, node))
 }
 
 async fn remove(store: &Store, present: &Stored) -> Result<Arc<Stored>, StoreError> {

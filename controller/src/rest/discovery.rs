@@ -75,6 +75,9 @@ fn resource(entry: &Entry) -> Vec<Value> {
     if entry.has_log {
         sub("log", info.kind, vec!["get"]);
     }
+    if info.kind == "Node" {
+        sub("fence", "NodeFence", vec!["create"]);
+    }
     all
 }
 

@@ -133,13 +133,23 @@ impl Failure {
 
     /// 422 with every violation as a cause.
     pub(crate) fn invalid(entry: &Entry, name: &str, violations: &Violations) -> Self {
+        let what = format!("{} {name:?}", entry.kind_and_group());
+        let mut failure = Self::invalid_body(&what, violations);
+        let causes = failure.details["causes"].take();
+        failure = failure.about(entry, name);
+        failure.details["kind"] = entry.info.kind.into();
+        failure.details["causes"] = causes;
+        failure
+    }
+
+    /// The same for a body that is no object.
+    pub(crate) fn invalid_body(what: &str, violations: &Violations) -> Self {
         let texts: Vec<String> = violations.iter().map(ToString::to_string).collect();
         let texts = match &texts[..] {
             [only] => only.clone(),
             several => format!("[{}]", several.join(", ")),
         };
-        let kind = entry.kind_and_group();
-        let message = format!("{kind} {name:?} is invalid: {texts}");
+        let message = format!("{what} is invalid: {texts}");
         let causes: Vec<Value> = violations
             .iter()
             .map(|violation| {
@@ -150,10 +160,8 @@ impl Failure {
                 })
             })
             .collect();
-        let mut failure =
-            Self::new(StatusCode::UNPROCESSABLE_ENTITY, "Invalid", message).about(entry, name);
-        failure.details["kind"] = entry.info.kind.into();
-        failure.details["causes"] = causes.into();
+        let mut failure = Self::new(StatusCode::UNPROCESSABLE_ENTITY, "Invalid", message);
+        failure.details = json!({"causes": causes});
         failure
     }
 

@@ -3,17 +3,18 @@
 //! The Node is created when it is missing, so that an agent needs nothing but its token.
 
 use http::StatusCode;
+use muster_api::kind::node::NodeKind;
 use muster_api::name::check_name;
+use rustls_pki_types::CertificateDer;
+use rustls_pki_types::pem::PemObject as _;
 use serde::Deserialize;
 use serde_json::json;
 
+use super::enrol::{self, Candidate, Right};
 use super::failure::Failure;
-use super::{Answer, Call, body, create, token};
+use super::{Answer, Call, body, token};
 use crate::auth::Identity;
 use crate::context::Context;
-use crate::store::{Key, Resource};
-
-const NODES: Resource = Resource::new("nodes");
 
 #[derive(Debug, Deserialize)]
 #[serde(rename_all = "camelCase", deny_unknown_fields)]
@@ -22,8 +23,7 @@ struct Request {
     #[serde(default)]
     token: Option<String>,
     node_name: String,
-    /// `Robot` or `Cloud`.
-    kind: String,
+    kind: NodeKind,
     /// PKCS #10, PEM.
     csr: String,
 }
@@ -37,26 +37,21 @@ pub(super) async fn join(call: Call) -> Answer {
     if let Err(error) = check_name(&asked.node_name) {
         return Err(Failure::bad_request(format!("nodeName: {error}")));
     }
-    if !matches!(asked.kind.as_str(), "Robot" | "Cloud") {
-        return Err(Failure::bad_request(format!("kind: {:?} is not Robot or Cloud", asked.kind)));
-    }
     // Before the token is spent: a request that cannot be signed must not use it up.
     let certificate = context
         .pki
         .sign_node(&asked.node_name, &asked.csr, context.clock.now())
         .map_err(|error| Failure::bad_request(format!("csr: {}", crate::app::chain(&error))))?;
-    check_kind(&context, &asked)?;
-    match (&asked.token, &identity) {
-        (Some(text), _) => token::spend(&context, text, &asked.node_name).await?,
-        (None, Identity::Node { name }) if *name == asked.node_name => {}
-        (None, _) => {
-            return Err(Failure::unauthorized(
-                "a join token is needed, or the node's own certificate",
-            ));
-        }
+    let candidate =
+        Candidate { node: &asked.node_name, kind: asked.kind, key: key_of(&certificate)? };
+    let taken = enrol::check(&context, &candidate)?;
+    let right = right(&context, &asked, &identity, taken).await?;
+    enrol::enrol(&context, &candidate, right).await?;
+    // Whoever spoke for the node until now has to show the key that counts.
+    if let (Some(live), Ok(name)) = (context.live(), asked.node_name.parse()) {
+        live.sessions.kick(&name);
     }
-    ensure_node(&context, &asked).await?;
-    tracing::info!(node = asked.node_name, kind = asked.kind, "joined");
+    tracing::info!(node = asked.node_name, kind = ?asked.kind, ?right, "joined");
     Ok(super::json(
         StatusCode::OK,
         &json!({
@@ -66,36 +61,26 @@ pub(super) async fn join(call: Call) -> Answer {
     ))
 }
 
-/// A robot does not become a server because somebody mistyped a name.
-fn check_kind(context: &Context, asked: &Request) -> Result<(), Failure> {
-    let Some(node) = context.store.get(&Key::cluster(NODES, asked.node_name.as_str())) else {
-        return Ok(());
-    };
-    let value = node.value();
-    match value["spec"]["kind"].as_str() {
-        Some(is) if is != asked.kind => {
-            let name = &asked.node_name;
-            let message = format!("node {name:?} is registered as {is}, not as {}", asked.kind);
-            Err(Failure::new(StatusCode::CONFLICT, "Conflict", message))
+async fn right(
+    context: &Context,
+    asked: &Request,
+    identity: &Identity,
+    taken: bool,
+) -> Result<Right, Failure> {
+    match (&asked.token, identity) {
+        (Some(text), _) => token::spend(context, text, &asked.node_name, taken).await,
+        (None, Identity::Node { name, .. }) if *name == asked.node_name => Ok(Right::Renewal),
+        (None, _) => {
+            Err(Failure::unauthorized("a join token is needed, or the node's own certificate"))
         }
-        _ => Ok(()),
     }
 }
 
-async fn ensure_node(context: &Context, asked: &Request) -> Result<(), Failure> {
-    if context.store.get(&Key::cluster(NODES, asked.node_name.as_str())).is_some() {
-        return Ok(());
-    }
-    let object = json!({
-        "apiVersion": muster_api::API_VERSION,
-        "kind": "Node",
-        "metadata": {"name": asked.node_name},
-        "spec": {"kind": asked.kind},
-    });
-    match create::create_object(context, NODES, object).await {
-        Ok(_) => Ok(()),
-        // Somebody registered it in between.
-        Err(failure) if failure.code() == 409 => check_kind(context, asked),
-        Err(failure) => Err(failure),
+/// The key of a certificate that was just signed.
+fn key_of(certificate: &str) -> Result<String, Failure> {
+    let der = CertificateDer::from_pem_slice(certificate.as_bytes());
+    match der.as_ref().map(|der| Identity::of(Some(der))) {
+        Ok(Identity::Node { key, .. }) => Ok(key),
+        _ => Err(Failure::internal("a certificate was signed that is no node's")),
     }
 }

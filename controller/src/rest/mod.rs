@@ -12,7 +12,8 @@
 //! | `metadata`, `admission` | server-owned fields; violations, unknown fields |
 //! | `selector` | label and field selectors |
 //! | [`namespace`] | the default namespace; ending of namespaces |
-//! | [`token`], `join` | join tokens; certificates for agents |
+//! | [`token`], `join`, `enrol` | join tokens; certificates for agents; which agent speaks for a node |
+//! | `fence` | a person's word that a node is off |
 //! | `offers` | what frameworks are offered, and why they are not |
 //! | `question` | plan, why, usage: answers that are no objects |
 //! | [`log`] | logs of tasks |
@@ -23,7 +24,9 @@ mod body;
 pub mod create;
 pub mod delete;
 mod discovery;
+pub(crate) mod enrol;
 pub mod failure;
+mod fence;
 mod join;
 mod list;
 pub mod log;
@@ -147,6 +150,9 @@ async fn objects(call: Call, verb: Verb, object: Object) -> Answer {
     }
     if !object.allows(verb) {
         return Err(Failure::method_not_allowed(verb, &object));
+    }
+    if object.subresource == Some(Subresource::Fence) {
+        return fence::fence(call, object).await;
     }
     match verb {
         Verb::Get => list::get(&call, &object),

@@ -77,6 +77,8 @@ pub enum Subresource {
     Log,
     /// `…/why`
     Why,
+    /// `…/fence`
+    Fence,
 }
 
 /// One object, or a collection when `name` is `None`.
@@ -99,6 +101,7 @@ impl Object {
     pub(crate) fn allows(&self, verb: Verb) -> bool {
         match self.subresource {
             Some(Subresource::Log | Subresource::Why) => verb == Verb::Get,
+            Some(Subresource::Fence) => verb == Verb::Create,
             Some(Subresource::Status) => {
                 self.entry.info.has_status
                     && (verb == Verb::Get
@@ -234,6 +237,7 @@ fn object(group: &str, parts: &[&str]) -> Option<Object> {
         Some("status") if entry.info.has_status => Some(Subresource::Status),
         Some("log") if entry.has_log => Some(Subresource::Log),
         Some("why") if entry.has_why => Some(Subresource::Why),
+        Some("fence") if entry.info.kind == "Node" => Some(Subresource::Fence),
         Some(_) => return None,
     };
     // An object of a namespaced kind has no path outside its namespace.
@@ -281,6 +285,12 @@ mod tests {
             ),
             ("GET", format!("{g}/tasks/t"), "404"),
             ("GET", format!("{g}/nodes/n/log"), "404"),
+            (
+                "POST",
+                format!("{g}/nodes/n/fence"),
+                "create nodes ns=None name=Some(\"n\") sub=Some(Fence)",
+            ),
+            ("POST", format!("{g}/namespaces/a/tasks/t/fence"), "404"),
             ("DELETE", format!("{g}/nodes"), "deletecollection nodes ns=None name=None sub=None"),
             ("GET", "/api/v1/namespaces".into(), "list namespaces ns=None name=None sub=None"),
             (

@@ -10,6 +10,7 @@ use ring::rand::SecureRandom as _;
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
+use super::enrol::{self, Right};
 use super::failure::Failure;
 use super::path::Verb;
 use super::{Answer, Call, body};
@@ -58,8 +59,13 @@ struct Metadata {
 }
 
 #[derive(Debug, Default, Deserialize)]
-#[serde(default)]
+#[serde(rename_all = "camelCase", default, deny_unknown_fields)]
 struct NewToken {
+    /// Clients of Kubernetes send these two; what they say is known from the path.
+    #[serde(rename = "apiVersion")]
+    _api_version: Option<String>,
+    #[serde(rename = "kind")]
+    _kind: Option<String>,
     spec: TokenSpec,
 }
 
@@ -114,8 +120,7 @@ async fn create(call: Call) -> Answer {
     let (parts, body) = request.into_parts();
     let new: NewToken = match body::optional_json(&parts.headers, body).await? {
         Value::Null => NewToken::default(),
-        body => serde_json::from_value(body)
-            .map_err(|error| Failure::bad_request(format!("JoinToken: {error}")))?,
+        body => body::typed("JoinToken", body)?,
     };
     let made = make(&context, new.spec).await?;
     let stored = context.store.get(&Key::cluster(TOKENS, made.id.as_str()));
@@ -162,8 +167,13 @@ pub async fn make(context: &Context, spec: TokenSpec) -> Result<NewlyMade, Failu
     Ok(NewlyMade { token, id, expires })
 }
 
-/// Uses a token for `node`, or says why it does not hold.
-pub(super) async fn spend(context: &Context, token: &str, node: &str) -> Result<(), Failure> {
+/// Uses a token for `node`, or says why it does not hold. `taken`: an agent has joined as that node.
+pub(super) async fn spend(
+    context: &Context,
+    token: &str,
+    node: &str,
+    taken: bool,
+) -> Result<Right, Failure> {
     let parts: Vec<&str> = token.trim().split('.').collect();
     let &[PREFIX, id, secret, ca] = &parts[..] else {
         return Err(refused("it is not a join token"));
@@ -189,11 +199,17 @@ pub(super) async fn spend(context: &Context, token: &str, node: &str) -> Result<
         if record.spec.uses.is_some_and(|uses| record.used >= uses) {
             return Err(refused("it is used up"));
         }
+        if taken && record.spec.node_name.is_none() {
+            return Err(enrol::taken(node));
+        }
         record.used += 1;
         Ok(Some(serde_json::to_value(&record).expect("texts and numbers serialize")))
     });
     match spent.await {
-        Ok(_) => Ok(()),
+        Ok(stored) => Ok(match stored.value().pointer("/spec/nodeName") {
+            Some(_) => Right::ThisNode,
+            None => Right::AnyNode,
+        }),
         Err(UpdateError::Refused(failure)) => Err(failure),
         Err(UpdateError::Store(crate::store::StoreError::NotFound { .. })) => {
             Err(refused("it is not known here"))
@@ -272,6 +288,7 @@ mod tests {
             data_dir: dir.path().to_owned(),
             listen: "127.0.0.1:0".parse().unwrap(),
             kubeconfig: dir.path().join("kubeconfig"),
+            kubeconfig_asked: true,
             advertise: Vec::new(),
         };
         let (store, address) = (crate::store::memory::start().await, config.listen);
@@ -288,11 +305,11 @@ mod tests {
         let (context, clock) = context(&dir).await;
         let spec = TokenSpec { ttl_seconds: Some(60), ..TokenSpec::default() };
         let made = make(&context, spec).await.unwrap();
-        spend(&context, &made.token, "a").await.unwrap();
+        spend(&context, &made.token, "a", false).await.unwrap();
         *clock.0.lock().unwrap() += SignedDuration::from_secs(59);
-        spend(&context, &made.token, "b").await.unwrap();
+        spend(&context, &made.token, "b", false).await.unwrap();
         *clock.0.lock().unwrap() += SignedDuration::from_secs(1);
-        let refused = spend(&context, &made.token, "c").await.unwrap_err();
+        let refused = spend(&context, &made.token, "c", false).await.unwrap_err();
         assert_eq!(refused.code(), 401);
         assert!(refused.message().contains("expired at 2026-11-22T12:01:00Z"), "{refused:?}");
     }
@@ -305,7 +322,7 @@ mod tests {
         let made = make(&context, spec).await.unwrap();
         let tries = (0..8).map(|n| {
             let (context, token) = (&context, made.token.as_str());
-            async move { spend(context, token, &format!("n{n}")).await }
+            async move { spend(context, token, &format!("n{n}"), false).await }
         });
         let outcomes = futures::future::join_all(tries).await;
         assert_eq!(outcomes.iter().filter(|outcome| outcome.is_ok()).count(), 1);

@@ -4,6 +4,8 @@
 //! then the whole page of assignments. So an assignment never tells an agent to start what it has
 //! just reported as ended. Afterwards the session's task has four sources, all in one select: the
 //! agent's messages, changes of its page, a later session of the same node, the end of the controller.
+//!
+//! What the agent runs and should not is looked after in `strays`.
 
 use std::pin::Pin;
 use std::sync::Arc;
@@ -11,12 +13,13 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
 use futures::Stream;
-use muster_api::id::Incarnation;
+use muster_api::id::{Incarnation, TaskUid};
 use muster_api::name::NodeName;
 use muster_api::pose::Pose;
 use muster_api::wire::agent::v1 as wire;
 use muster_api::wire::agent_session::NodeReport;
 use muster_controller_core::node_health::{DETECT_AFTER, HEARTBEAT_EVERY};
+use muster_controller_core::stray::Strays;
 use tokio::sync::{Notify, mpsc};
 use tokio_stream::wrappers::ReceiverStream;
 use tokio_util::sync::CancellationToken;
@@ -27,9 +30,11 @@ use wire::controller_message::Body as ToAgent;
 
 use super::nodes::{self, Speaker};
 use super::proto::agent_service_server::AgentService;
+use super::strays::lives;
 use super::{Connection, NodeUsage, Sessions, reports};
 use crate::auth::Identity;
 use crate::context::Context;
+use crate::objects;
 use crate::reconcile::schedule;
 
 /// An agent that connects says Hello at once.
@@ -72,8 +77,8 @@ impl AgentService for Agents {
         &self,
         request: Request<Streaming<wire::AgentMessage>>,
     ) -> Result<Response<Self::SessionStream>, Status> {
-        let node = match request.extensions().get::<Identity>() {
-            Some(Identity::Node { name }) => name.clone(),
+        let (node, key) = match request.extensions().get::<Identity>() {
+            Some(Identity::Node { name, key }) => (name.clone(), key.clone()),
             _ => return Err(Status::unauthenticated("a node's client certificate is needed")),
         };
         let node = NodeName::new(node)
@@ -85,6 +90,9 @@ impl AgentService for Agents {
             scheduler: self.scheduler.clone(),
             id: self.next_id.fetch_add(1, Ordering::Relaxed),
             node,
+            key,
+            node_uid: "".into(),
+            strays: Strays::default(),
             inbound: request.into_inner(),
             to_agent,
         };
@@ -93,18 +101,23 @@ impl AgentService for Agents {
     }
 }
 
-struct Session {
-    context: Arc<Context>,
-    sessions: Arc<Sessions>,
+pub(super) struct Session {
+    pub(super) context: Arc<Context>,
+    pub(super) sessions: Arc<Sessions>,
     scheduler: schedule::Handle,
     id: u64,
-    node: NodeName,
+    pub(super) node: NodeName,
+    /// Of the agent's certificate.
+    key: String,
+    /// Of the Node for which this session speaks.
+    node_uid: Box<str>,
+    pub(super) strays: Strays,
     inbound: Streaming<wire::AgentMessage>,
     to_agent: Outbound,
 }
 
 /// Why a session ends other than by the agent's wish.
-enum End {
+pub(super) enum End {
     /// The agent closed it, or cannot be written to.
     Closed,
     /// The agent is told why.
@@ -150,22 +163,18 @@ impl Session {
             logs: Arc::clone(&logs),
             replaced: replaced.clone(),
         };
+        let sessions = Arc::clone(&self.sessions);
+        let beginning = sessions.begin().await;
+        // First of all: one that is not admitted must not end the session of one that is.
+        nodes::admit(&self.context, &speaker).map_err(|error| refused(&error))?;
         self.sessions.connect(&self.node, connection);
         // Heard before it is written that it is ready: whoever is about to write that it is silent looks
         // at this again, and must not overwrite the newer word with the older one.
         self.sessions.heard(&self.node);
-        self.take_node(&speaker, hello.state.as_ref()).await?;
-        for report in &hello.tasks {
-            self.apply_report(report).await?;
-        }
-        reports::unsaid(&self.context, &self.sessions, &self.node).await.map_err(internal)?;
+        self.write_hello(&speaker, &hello).await?;
+        drop(beginning);
         self.send(ToAgent::Welcome(welcome())).await?;
-        let (page, wake) = self.sessions.board().whole_page(&self.node);
-        let strays = strays(&hello, &page);
-        if !strays.is_empty() {
-            tracing::warn!(node = %self.node, ?strays, "the agent runs what it should not; it is told to stop it");
-        }
-        self.send(ToAgent::Assignments(page)).await?;
+        let wake = self.send_page(&hello.tasks).await?;
         for report in &hello.tasks {
             self.acknowledge(report).await?;
         }
@@ -176,6 +185,23 @@ impl Session {
             format!("agent {} is connected", speaker.version),
         );
         self.listen(&speaker, &wake, &mut relayed, &logs, &replaced).await
+    }
+
+    /// What Hello says, written down. Strays are known before the node is called ready.
+    async fn write_hello(&mut self, speaker: &Speaker, hello: &wire::Hello) -> Result<(), End> {
+        for report in &hello.tasks {
+            let uid = TaskUid::new(report.uid.clone());
+            // All of them are written with the node below.
+            let _ = self.strays.told(&uid, lives(report), self.is_assigned(&uid));
+        }
+        self.take_node(speaker, hello.state.as_ref()).await?;
+        if !self.strays.is_empty() {
+            self.tell_strays();
+        }
+        for report in &hello.tasks {
+            self.apply_report(report).await?;
+        }
+        reports::unsaid(&self.context, &self.sessions, &self.node).await.map_err(internal)
     }
 
     async fn listen(
@@ -194,14 +220,11 @@ impl Session {
                     self.take(body, speaker, logs).await?;
                 }
                 // Cancel safe: a permit that was not received stays.
-                () = wake.notified() => {
-                    if let Some(changed) = self.sessions.board().take_changed(&self.node) {
-                        self.send(ToAgent::Assignments(changed)).await?;
-                    }
-                }
+                () = wake.notified() => self.send_changed().await?,
                 Some(message) = relayed.recv() => self.send_message(message).await?,
                 () = replaced.cancelled() => {
-                    return Err(Status::aborted("a later session of this node has begun").into());
+                    self.is_admitted()?;
+                    return Err(Status::aborted("another session of this node has begun, or is asked for").into());
                 }
             }
         }
@@ -218,6 +241,7 @@ impl Session {
         }
         Ok(Speaker {
             node: self.node.clone(),
+            key: self.key.clone(),
             incarnation: Incarnation::new(hello.incarnation.clone()),
             version: hello.version.clone(),
         })
@@ -228,7 +252,7 @@ impl Session {
         message.body.ok_or_else(|| Status::invalid_argument("a message without a body").into())
     }
 
-    async fn send(&self, body: ToAgent) -> Result<(), End> {
+    pub(super) async fn send(&self, body: ToAgent) -> Result<(), End> {
         self.send_message(wire::ControllerMessage { body: Some(body) }).await
     }
 
@@ -245,7 +269,10 @@ impl Session {
         match body {
             Some(FromAgent::Heartbeat(heartbeat)) => self.take_heartbeat(heartbeat).await,
             Some(FromAgent::Task(report)) => self.take_report(&report).await,
-            Some(FromAgent::Node(state)) => self.take_node(speaker, Some(&state)).await,
+            Some(FromAgent::Node(state)) => {
+                self.is_newest()?;
+                self.take_node(speaker, Some(&state)).await
+            }
             Some(FromAgent::Log(chunk)) => {
                 let id = chunk.id;
                 if !logs.take(chunk) {
@@ -264,7 +291,25 @@ impl Session {
         }
     }
 
+    /// No later session of this node has begun; what an earlier one still reads is old.
+    pub(super) fn is_newest(&self) -> Result<(), End> {
+        match self.sessions.connection(&self.node).is_some_and(|c| c.id == self.id) {
+            true => Ok(()),
+            false => Err(Status::aborted("a later session of this node has begun").into()),
+        }
+    }
+
+    /// The Node for which this session speaks is still there.
+    fn is_admitted(&self) -> Result<(), End> {
+        let stored = self.context.store.get(&objects::node_key(self.node.as_str()));
+        match stored.is_some_and(|stored| stored.uid == self.node_uid) {
+            true => Ok(()),
+            false => Err(refused(&nodes::NodeError::Deleted { node: self.node.clone() })),
+        }
+    }
+
     async fn take_heartbeat(&mut self, heartbeat: wire::Heartbeat) -> Result<(), End> {
+        self.is_admitted()?;
         if self.sessions.heard(&self.node) {
             // It was given up meanwhile and its tasks are Unknown: a new session tells everything anew.
             return Err(Status::aborted("the node was silent for too long; say Hello again").into());
@@ -279,17 +324,12 @@ impl Session {
         self.send(ToAgent::Heartbeat(wire::HeartbeatAck { sequence: heartbeat.sequence })).await
     }
 
-    async fn take_report(&self, report: &wire::TaskReport) -> Result<(), End> {
-        self.apply_report(report).await?;
-        self.acknowledge(report).await
-    }
-
-    async fn acknowledge(&self, report: &wire::TaskReport) -> Result<(), End> {
+    pub(super) async fn acknowledge(&self, report: &wire::TaskReport) -> Result<(), End> {
         let ack = wire::TaskReportAck { uid: report.uid.clone(), sequence: report.sequence };
         self.send(ToAgent::Task(ack)).await
     }
 
-    async fn apply_report(&self, report: &wire::TaskReport) -> Result<(), End> {
+    pub(super) async fn apply_report(&self, report: &wire::TaskReport) -> Result<(), End> {
         reports::apply(&self.context, &self.sessions, &self.node, report).await.map_err(|error| {
             match error {
                 reports::ReportError::Wire(wire) => {
@@ -301,24 +341,34 @@ impl Session {
     }
 
     async fn take_node(
-        &self,
+        &mut self,
         speaker: &Speaker,
         state: Option<&wire::NodeState>,
     ) -> Result<(), End> {
         let state = state.ok_or_else(|| Status::invalid_argument("hello.state is missing"))?;
         let report =
             NodeReport::try_from(state).map_err(|e| Status::invalid_argument(e.to_string()))?;
-        nodes::write(&self.context, speaker, &report).await.map_err(|error| match error {
-            nodes::NodeError::KindChanged { .. } => {
-                End::Because(Status::failed_precondition(error.to_string()))
-            }
+        let written = nodes::write(&self.context, speaker, &report, &self.stray_names()).await;
+        self.node_uid = written.map_err(|error| match error {
             nodes::NodeError::Store(store) => internal(store),
-        })
+            error => refused(&error),
+        })?;
+        Ok(())
+    }
+}
+
+/// Trying again does not help: a person has to do something first.
+fn refused(error: &nodes::NodeError) -> End {
+    match error {
+        nodes::NodeError::Deleted { .. } | nodes::NodeError::OtherAgent { .. } => {
+            End::Because(Status::permission_denied(error.to_string()))
+        }
+        _ => End::Because(Status::failed_precondition(error.to_string())),
     }
 }
 
 /// The agent tries again; what it said is not lost, it repeats it.
-fn internal(error: crate::store::StoreError) -> End {
+pub(super) fn internal(error: crate::store::StoreError) -> End {
     End::Because(Status::unavailable(crate::app::chain(&error)))
 }
 
@@ -329,11 +379,4 @@ fn welcome() -> wire::Welcome {
         heartbeat_interval_ms: millis(HEARTBEAT_EVERY),
         detect_after_ms: millis(DETECT_AFTER),
     }
-}
-
-/// Live tasks that the agent knows of and the store does not.
-fn strays<'a>(hello: &'a wire::Hello, page: &wire::Assignments) -> Vec<&'a str> {
-    let ended = [wire::TaskPhase::Succeeded.into(), wire::TaskPhase::Failed.into()];
-    let live = hello.tasks.iter().filter(|t| !ended.contains(&t.phase));
-    live.map(|t| t.uid.as_str()).filter(|uid| page.upserts.iter().all(|a| a.uid != *uid)).collect()
 }

@@ -14,6 +14,7 @@
 //! | [`nodes`] | what an agent says of its node → the Node object |
 //! | [`reports`] | what an agent says of a task → the Task object and its lease |
 //! | [`frameworks`] | the sessions of frameworks |
+//! | `strays` | what an agent runs and should not |
 //! | [`logs`] | logs, asked of the agent that has them |
 
 pub mod agents;
@@ -22,6 +23,7 @@ pub mod frameworks;
 pub mod logs;
 pub mod nodes;
 pub mod reports;
+mod strays;
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -30,7 +32,7 @@ use std::time::Duration;
 use muster_api::name::NodeName;
 use muster_api::wire::agent::v1 as wire;
 use muster_controller_core::node_health::{DETECT_AFTER, Monotonic, NodeHealth};
-use tokio::sync::{Notify, mpsc};
+use tokio::sync::{Notify, RwLock, RwLockReadGuard, RwLockWriteGuard, mpsc};
 use tokio::time::Instant;
 
 use board::Board;
@@ -71,6 +73,9 @@ pub(crate) struct Connection {
 pub struct Sessions {
     board: Board,
     connections: Mutex<HashMap<NodeName, Connection>>,
+    /// Read: a session begins. Written: a person decides over a node that must not begin one meanwhile.
+    /// Held over writes to the store only, never while an agent is waited for.
+    beginnings: RwLock<()>,
     health: Mutex<NodeHealth>,
     health_changed: Notify,
     usage: Mutex<UsageTable>,
@@ -82,6 +87,7 @@ impl Default for Sessions {
         Sessions {
             board: Board::default(),
             connections: Mutex::default(),
+            beginnings: RwLock::default(),
             health: Mutex::new(NodeHealth::new(DETECT_AFTER)),
             health_changed: Notify::new(),
             usage: Mutex::default(),
@@ -155,6 +161,16 @@ impl Sessions {
 
     pub(crate) fn connection(&self, node: &NodeName) -> Option<Connection> {
         lock(&self.connections).get(node).cloned()
+    }
+
+    /// Held while a session begins.
+    pub(crate) async fn begin(&self) -> RwLockReadGuard<'_, ()> {
+        self.beginnings.read().await
+    }
+
+    /// Held while a node is fenced or deleted: no session begins meanwhile.
+    pub(crate) async fn hold_back(&self) -> RwLockWriteGuard<'_, ()> {
+        self.beginnings.write().await
     }
 
     /// Takes a session in; an earlier one of the same node ends.

@@ -4,18 +4,21 @@
 //! owns `spec` (but for what the agent said when it joined first); the controller owns Ready and the
 //! books.
 
+use std::sync::Arc;
+
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::{MicroTime, Time};
 use muster_api::condition::{self, Condition, ConditionStatus, set_condition};
 use muster_api::id::Incarnation;
 use muster_api::kind::lease::{DEFAULT_GROUP, Lease, LeaseSpec, LeaseStatus};
-use muster_api::kind::node::{Node, NodeKind, NodeSpec, NodeStatus};
+use muster_api::kind::node::{Node, NodeKind, NodeStatus};
 use muster_api::name::NodeName;
 use muster_api::pose::Pose;
 use muster_api::wire::agent_session::NodeReport;
 
 use crate::context::Context;
 use crate::objects;
-use crate::store::{Op, StoreError};
+use crate::rest::enrol;
+use crate::store::{Op, StoreError, Stored};
 
 /// How far a robot moves until its pose is written down again, metres. In between, the live pose is
 /// what placement uses.
@@ -25,6 +28,8 @@ const POSE_STEP: f64 = 1.0;
 #[derive(Debug, Clone)]
 pub(crate) struct Speaker {
     pub(crate) node: NodeName,
+    /// The key of its certificate.
+    pub(crate) key: String,
     pub(crate) incarnation: Incarnation,
     pub(crate) version: String,
 }
@@ -36,26 +41,42 @@ pub(crate) enum NodeError {
         "node {node} joined as a {was:?} and now says that it is a {says:?}; delete the node, or correct the agent's --kind"
     )]
     KindChanged { node: NodeName, was: NodeKind, says: NodeKind },
+    #[error(
+        "there is no node {node}: it was deleted, and its certificate with it; to take it in again make a token (`muster token create --node {node}`) and start its agent with it"
+    )]
+    Deleted { node: NodeName },
+    #[error(
+        "the certificate is not that of node {node}'s agent: the node was registered anew, or another agent has joined in its place; `muster token create --node {node}` makes a token with which this agent may join again"
+    )]
+    OtherAgent { node: NodeName },
     #[error(transparent)]
     Store(#[from] StoreError),
 }
 
-/// Writes what an agent says of its node; creates the Node when it is new. Ready becomes true.
+/// The Node for which an agent may speak.
+pub(crate) fn admit(
+    context: &Context,
+    speaker: &Speaker,
+) -> Result<(Arc<Stored>, Node), NodeError> {
+    let stored = context.store.get(&objects::node_key(speaker.node.as_str()));
+    let node = stored.and_then(|s| objects::read::<Node>(&s).map(|node| (s, node)));
+    let (stored, node) = node.ok_or_else(|| NodeError::Deleted { node: speaker.node.clone() })?;
+    if !enrol::is_agent_of(&node, &speaker.key) {
+        return Err(NodeError::OtherAgent { node: speaker.node.clone() });
+    }
+    Ok((stored, node))
+}
+
+/// Writes what an agent says of its node; gives the Node's uid. Ready becomes true, unless it runs
+/// `strays`.
 pub(crate) async fn write(
     context: &Context,
     speaker: &Speaker,
     report: &NodeReport,
-) -> Result<(), NodeError> {
-    let key = objects::node_key(speaker.node.as_str());
+    strays: &[String],
+) -> Result<Box<str>, NodeError> {
     loop {
-        let Some(stored) = context.store.get(&key) else {
-            match context.store.apply(create(context, speaker, report)).await {
-                Ok(_) => return Ok(()),
-                Err(error) if objects::is_race(&error) => continue,
-                Err(error) => return Err(error.into()),
-            }
-        };
-        let Some(mut node) = objects::read::<Node>(&stored) else { return Ok(()) };
+        let (stored, mut node) = admit(context, speaker)?;
         if node.spec.kind != report.kind {
             return Err(NodeError::KindChanged {
                 node: speaker.node.clone(),
@@ -65,32 +86,18 @@ pub(crate) async fn write(
         }
         let before = node.clone();
         fill(context, speaker, report, &mut node);
+        judge(node.status.get_or_insert_default(), strays, context.clock.now());
         let mut ops = Vec::new();
         if node != before {
             ops.push(objects::replace(&stored, &node));
         }
         ops.extend(free_lease(context, speaker, report));
         match context.store.apply(ops).await {
-            Ok(_) => return Ok(()),
+            Ok(_) => return Ok(stored.uid.clone()),
             Err(error) if objects::is_race(&error) => tokio::task::yield_now().await,
             Err(error) => return Err(error.into()),
         }
     }
-}
-
-fn create(context: &Context, speaker: &Speaker, report: &NodeReport) -> Vec<Op> {
-    let spec = NodeSpec {
-        kind: report.kind,
-        unschedulable: false,
-        taints: Vec::new(),
-        speed: report.speed,
-    };
-    let mut node = Node::new(speaker.node.as_str(), spec);
-    objects::stamp_new(&mut node.metadata, context.clock.now());
-    fill(context, speaker, report, &mut node);
-    let mut ops = vec![objects::create(objects::node_key(speaker.node.as_str()), &node)];
-    ops.extend(free_lease(context, speaker, report));
-    ops
 }
 
 /// The Lease object of a robot's actuators, so that a free robot can be seen to be free.
@@ -146,21 +153,57 @@ fn fill(context: &Context, speaker: &Speaker, report: &NodeReport, node: &mut No
         set_condition(&mut status.conditions, condition.clone(), &Time(now));
     }
     let said: Vec<&str> = report.conditions.iter().map(|c| c.r#type.as_str()).collect();
-    status.conditions.retain(|c| c.r#type == condition::READY || said.contains(&c.r#type.as_str()));
-    set_ready(status, now);
+    let ours = [condition::READY, condition::FENCED];
+    status.conditions.retain(|c| ours.iter().chain(&said).any(|known| *known == c.r#type.as_str()));
 }
 
-fn set_ready(status: &mut NodeStatus, now: jiff::Timestamp) {
-    let ready = Condition {
-        r#type: condition::READY.to_owned(),
-        status: ConditionStatus::True,
-        reason: "AgentReady".to_owned(),
-        message: "its agent is connected".to_owned(),
-        last_transition_time: None,
+/// What the controller says of a node whose agent is connected and runs `strays`.
+fn judge(status: &mut NodeStatus, strays: &[String], now: jiff::Timestamp) {
+    let fenced = status.condition(condition::FENCED);
+    let fenced = fenced.is_some_and(|c| c.status == ConditionStatus::True);
+    let conditions = &mut status.conditions;
+    let mut set = |r#type: &str, holds: bool, reason: &str, message: String| {
+        let condition = Condition {
+            r#type: r#type.to_owned(),
+            status: holds.into(),
+            reason: reason.to_owned(),
+            message,
+            last_transition_time: None,
+        };
+        set_condition(conditions, condition, &Time(now))
     };
-    if set_condition(&mut status.conditions, ready, &Time(now)) {
+    let news = if strays.is_empty() {
+        if fenced {
+            let message = "its agent is back, and nothing is left of what ran before".to_owned();
+            set(condition::FENCED, false, "NothingLeft", message);
+        }
+        set(condition::READY, true, "AgentReady", "its agent is connected".to_owned())
+    } else {
+        let names = strays.join(", ");
+        let message = format!(
+            "its agent runs what it should not, and is told to stop it: {names}; nothing new begins there until that has ended"
+        );
+        set(condition::READY, false, "StrayTasks", message)
+    };
+    if news {
         status.last_seen = Some(MicroTime(now));
     }
+}
+
+/// Writes that the strays of a connected agent are others than before.
+pub(crate) async fn write_strays(
+    context: &Context,
+    node: &NodeName,
+    strays: &[String],
+) -> Result<(), StoreError> {
+    let key = objects::node_key(node.as_str());
+    objects::change(&context.store, &key, |stored, mut object: Node| {
+        let before = object.clone();
+        judge(object.status.get_or_insert_default(), strays, context.clock.now());
+        (object != before).then(|| vec![objects::replace(stored, &object)])
+    })
+    .await
+    .map(drop)
 }
 
 /// A pose worth writing down: in another map, or a step away.

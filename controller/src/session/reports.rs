@@ -83,11 +83,12 @@ pub(crate) async fn apply(
 }
 
 /// Whether a report says something that is not written yet. A task that was lost with its node is
-/// told again by a report that was applied before.
+/// told again by a report that was applied before. An end stays as it was written first: what an agent
+/// says of the end of a task that a person fenced is not why it ended.
 fn is_news(status: &TaskStatus, phase: TaskPhase, sequence: u64) -> bool {
     let newer = sequence > status.report_sequence;
     let again = sequence == status.report_sequence && status.phase == TaskPhase::Unknown;
-    (newer || again) && status.phase.may_become(phase)
+    (newer || again) && !status.phase.is_terminal() && status.phase.may_become(phase)
 }
 
 /// Puts what a person should see into an Event.
@@ -156,5 +157,6 @@ mod tests {
             "a node that comes back says the same again"
         );
         assert!(!is_news(&status(Succeeded, 3), Failed, 9), "an end stays");
+        assert!(!is_news(&status(Failed, 3), Failed, 9), "and so does why");
     }
 }

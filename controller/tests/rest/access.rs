@@ -110,6 +110,7 @@ async fn a_second_controller_on_the_same_directory_is_refused() {
         data_dir: cluster.dir.path().join("data"),
         listen: "127.0.0.1:0".parse().unwrap(),
         kubeconfig: cluster.dir.path().join("other"),
+        kubeconfig_asked: true,
         advertise: Vec::new(),
     };
     let refused = app::start(config).await.unwrap_err();

@@ -2,6 +2,8 @@
 #![expect(clippy::unwrap_used, reason = "a failed step of a test is the test's failure")]
 
 mod access;
+mod agent;
+mod fencing;
 mod objects;
 mod removal;
 mod support;

@@ -198,7 +198,20 @@ async fn discovery_tells_what_there_is() {
     named.sort_unstable();
     assert_eq!(
         named,
-        ["leases", "leases/status", "nodes", "nodes/status", "tasks", "tasks/log", "tasks/status"]
+        [
+            "frameworks",
+            "frameworks/status",
+            "leases",
+            "leases/status",
+            "nodes",
+            "nodes/fence",
+            "nodes/status",
+            "quotas",
+            "quotas/status",
+            "tasks",
+            "tasks/log",
+            "tasks/status"
+        ]
     );
     let task = list.resources.iter().find(|r| r.name == "tasks").unwrap();
     assert_eq!(task.short_names.as_deref(), Some(&["tk".to_owned()][..]));

@@ -14,6 +14,9 @@ pub(crate) const G: &str = "/apis/muster.dev/v1alpha1";
 pub(crate) const TASKS: &str = "/apis/muster.dev/v1alpha1/namespaces/default/tasks";
 pub(crate) const EVENTS: &str = "/api/v1/namespaces/default/events";
 
+/// No wait in a test should take this long; a machine under load may need a good part of it.
+pub(crate) const DEADLINE: std::time::Duration = std::time::Duration::from_secs(60);
+
 pub(crate) struct Cluster {
     pub(crate) running: Running,
     pub(crate) dir: TempDir,
@@ -31,6 +34,24 @@ impl Cluster {
         running.shut_down().await.unwrap();
         let running = app::start(config(&dir)).await.unwrap();
         Self { running, dir }
+    }
+
+    /// Waits until the object at `path` is as wanted, woken by the store's changes.
+    pub(crate) async fn until(&self, path: &str, wanted: impl Fn(&Value) -> bool) -> Value {
+        let (store, admin) = (&self.running.context().store, self.admin().await);
+        let mut last = Value::Null;
+        let waited = tokio::time::timeout(DEADLINE, async {
+            loop {
+                let mut changes = store.watch_all(store.revision()).unwrap();
+                last = get(&admin, path).await.1;
+                if wanted(&last) {
+                    return;
+                }
+                changes.next().await.unwrap();
+            }
+        });
+        assert!(waited.await.is_ok(), "{path} is still {last}");
+        last
     }
 
     pub(crate) fn kubeconfig(&self) -> PathBuf {
@@ -78,6 +99,7 @@ fn config(dir: &TempDir) -> Config {
         data_dir: dir.path().join("data"),
         listen: "127.0.0.1:0".parse().unwrap(),
         kubeconfig: dir.path().join("kubeconfig"),
+        kubeconfig_asked: true,
         advertise: Vec::new(),
     }
 }

@@ -116,6 +116,7 @@ pub(crate) async fn queue() {
             data_dir: dir.path().join("controller"),
             listen: "127.0.0.1:0".parse().expect("an address"),
             kubeconfig: dir.path().join("kubeconfig"),
+            kubeconfig_asked: true,
             advertise: Vec::new(),
         };
         let running = app::start(config).await.expect("a controller");

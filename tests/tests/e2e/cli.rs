@@ -11,7 +11,7 @@ fn manifests() -> std::path::PathBuf {
 }
 
 /// Runs `muster`; the exit code, what it wrote to stdout, and to stderr.
-fn muster(cluster: &Cluster, args: &[&str]) -> (i32, String, String) {
+pub(crate) fn muster(cluster: &Cluster, args: &[&str]) -> (i32, String, String) {
     let output: Output = Command::new(binary("muster"))
         .args(args)
         .env("MUSTER_CONFIG", cluster.kubeconfig())

@@ -2,7 +2,9 @@
 
 mod cli;
 mod demo;
+mod fence;
 mod figure4;
+mod frameworks;
 mod lease;
 mod quotas;
 mod survival;

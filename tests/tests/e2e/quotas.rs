@@ -140,10 +140,11 @@ mod container {
         let status = cluster.phase("patient", TaskPhase::Failed).await.status.expect("failed");
         assert_eq!((status.exit_code, status.attempt), (Some(7), 1), "{status:?}");
         cluster.delete("patient").await;
-        assert_eq!(
-            docker::containers_of(&uid),
-            Vec::<String>::new(),
-            "containers are removed with their task"
-        );
+        // The agent hears of the deletion after the object is gone.
+        wait::until("containers are removed with their task", || {
+            let left = docker::containers_of(&uid);
+            async move { if left.is_empty() { Ok(()) } else { Err(format!("{left:?}")) } }
+        })
+        .await;
     }
 }

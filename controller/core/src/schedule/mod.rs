@@ -179,12 +179,16 @@ fn choose(cluster: &Cluster, demand: &Demand) -> Option<Slot> {
         return filter::refusal(cluster.at(slot), demand).is_none().then_some(slot);
     }
     let mut second_best = None;
-    if spec.resources.is_compute_only() {
+    // A kind that the task does not allow is not scanned: thousands of nodes would say the same.
+    if spec.resources.is_compute_only() && spec.allows_kind(NodeKind::Cloud) {
         // A CR-only task prefers the cloud: robots' CR is scarce, and it gains nothing there.
         let cloud = first_fit(cluster, demand, cluster.by_free(NodeKind::Cloud), &mut second_best);
         if cloud.is_some() {
             return cloud;
         }
+    }
+    if !spec.allows_kind(NodeKind::Robot) {
+        return second_best;
     }
     let robot = match (&spec.placement.at, spec.placement.cost) {
         (None, _) => first_fit(cluster, demand, cluster.by_free(NodeKind::Robot), &mut second_best),

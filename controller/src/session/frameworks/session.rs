@@ -98,8 +98,8 @@ async fn serve(frameworks: Arc<Frameworks>, wire: Wire, guest: Guest) {
     let number = frameworks.session_number();
     let session_id = uuid::Uuid::new_v4().to_string();
     let (events, mut told) = mpsc::channel(EVENTS);
-    let cut = CancellationToken::new();
-    let outlet = Outlet::new(number, events, cut.clone());
+    let (cut, slow) = (CancellationToken::new(), CancellationToken::new());
+    let outlet = Outlet::new(number, events, slow.clone());
     let mailbox = Arc::new(Mailbox::default());
     let mut session = Session {
         frameworks: Arc::clone(&frameworks),
@@ -119,6 +119,8 @@ async fn serve(frameworks: Arc<Frameworks>, wire: Wire, guest: Guest) {
         tokio::select! {
             worked = worked => worked,
             () = cut.cancelled() => Err(Closed),
+            // It is told nothing: it does not read, and may come back.
+            () = slow.cancelled() => Err(Closed),
             () = frameworks.context.stop.cancelled() => Err(Closed),
         }
     };
@@ -126,7 +128,7 @@ async fn serve(frameworks: Arc<Frameworks>, wire: Wire, guest: Guest) {
         refuse_quickly(
             &session.out,
             "Cut",
-            "a later session of this framework began, it was removed, or it did not read",
+            "a later session of this framework began, or it was removed",
         );
     }
     tracing::info!(framework = %key, torn_down = ended.is_ok(), "framework's session ended");

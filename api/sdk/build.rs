@@ -1,0 +1,21 @@
+//! Compiles the framework's side of the session service. The messages themselves are `muster-api`'s.
+//! The controller's side is compiled as well, to a file of its own that only tests include.
+
+use std::path::Path;
+
+fn main() -> Result<(), Box<dyn std::error::Error>> {
+    let root = Path::new("../proto");
+    println!("cargo:rerun-if-changed=../proto/muster/framework");
+    let out = std::env::var("OUT_DIR")?;
+    let server = Path::new(&out).join("server");
+    std::fs::create_dir_all(&server)?;
+    let files = || protox::compile([root.join("muster/framework/v1/framework.proto")], [root]);
+    let stub = || {
+        tonic_prost_build::configure()
+            .build_transport(false)
+            .extern_path(".muster.framework.v1", "::muster_api::wire::framework::v1")
+    };
+    stub().build_server(false).compile_fds(files()?)?;
+    stub().build_client(false).out_dir(server).compile_fds(files()?)?;
+    Ok(())
+}

@@ -1,0 +1,150 @@
+//! What happens to a framework, as a stream.
+
+use std::future::poll_fn;
+use std::pin::Pin;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::task::{Context, Poll};
+
+use futures::Stream;
+use muster_api::wire::framework::v1 as proto;
+use tokio::sync::mpsc;
+use tokio_util::task::AbortOnDropHandle;
+
+use crate::FrameworkError;
+
+/// Something that happened.
+#[derive(Debug, Clone, PartialEq)]
+#[non_exhaustive]
+pub enum Event {
+    /// The controller knows the framework now, under this id.
+    Registered {
+        /// The id that brings it back to its tasks.
+        framework_id: String,
+    },
+    /// The framework is back and its tasks are still its own. Offers from before are gone.
+    Reregistered,
+    /// The session broke; it is being made again. Every outstanding offer is gone.
+    Disconnected,
+    /// Nodes with room, the closest first.
+    Offers(Vec<proto::Offer>),
+    /// Offers that hold no more.
+    Rescinded {
+        /// Their ids.
+        offers: Vec<String>,
+        /// Why.
+        reason: proto::RescindReason,
+    },
+    /// The present state of a task. Said once by the SDK, and again by the controller until it is acknowledged.
+    Update(proto::Update),
+    /// From an executor; at most once, in order.
+    Message(proto::Message),
+    /// A node does not answer.
+    NodeLost(proto::NodeLost),
+    /// An executor ended.
+    ExecutorLost(proto::ExecutorLost),
+    /// The framework has ended; nothing comes after it.
+    Error(FrameworkError),
+}
+
+/// Messages of executors that come when so many events wait already are dropped: they come at most once anyway, and
+/// may be large. All else waits, however long: it is little, and an answer may be behind it.
+const MOST_WAITING: usize = 1024;
+
+/// Begins a stream.
+pub(crate) fn channel() -> (Outlet, Inlet) {
+    let (sender, events) = mpsc::unbounded_channel();
+    let waiting = Arc::new(AtomicUsize::new(0));
+    (Outlet { sender, waiting: Arc::clone(&waiting) }, Inlet { events, waiting })
+}
+
+/// The session's end of the stream. It never waits for the framework's code, which may itself wait for an answer that
+/// only the session can hear.
+#[derive(Debug, Clone)]
+pub(crate) struct Outlet {
+    sender: mpsc::UnboundedSender<Event>,
+    waiting: Arc<AtomicUsize>,
+}
+
+impl Outlet {
+    pub(crate) fn send(&self, event: Event) {
+        let waiting = self.waiting.load(Ordering::Relaxed);
+        if matches!(event, Event::Message(_)) && waiting >= MOST_WAITING {
+            tracing::warn!(
+                waiting,
+                "a message of an executor is dropped: the framework does not keep up"
+            );
+            return;
+        }
+        self.waiting.fetch_add(1, Ordering::Relaxed);
+        // A stream that was dropped ends the session; see closed().
+        drop(self.sender.send(event));
+    }
+
+    /// Resolves when the stream is dropped.
+    pub(crate) async fn closed(&self) {
+        self.sender.closed().await;
+    }
+}
+
+/// The other end.
+#[derive(Debug)]
+pub(crate) struct Inlet {
+    events: mpsc::UnboundedReceiver<Event>,
+    waiting: Arc<AtomicUsize>,
+}
+
+/// The events of one framework. Ends after [`Event::Error`] or when the framework is stopped. Dropping it ends the
+/// session; the framework's tasks go on until its failover timeout.
+#[derive(Debug)]
+pub struct EventStream {
+    pub(crate) inlet: Inlet,
+    /// The session's task ends with the stream.
+    pub(crate) _session: AbortOnDropHandle<()>,
+}
+
+impl EventStream {
+    /// The next event; none: the framework has ended. Cancel-safe.
+    pub async fn next(&mut self) -> Option<Event> {
+        poll_fn(|context| self.poll(context)).await
+    }
+
+    fn poll(&mut self, context: &mut Context<'_>) -> Poll<Option<Event>> {
+        let polled = self.inlet.events.poll_recv(context);
+        if let Poll::Ready(Some(_)) = polled {
+            self.inlet.waiting.fetch_sub(1, Ordering::Relaxed);
+        }
+        polled
+    }
+}
+
+impl Stream for EventStream {
+    type Item = Event;
+
+    fn poll_next(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Option<Event>> {
+        self.poll(context)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[tokio::test]
+    async fn a_framework_that_does_not_read_loses_messages_and_nothing_else() {
+        let (outlet, inlet) = channel();
+        let session = AbortOnDropHandle::new(tokio::spawn(async {}));
+        let mut stream = EventStream { inlet, _session: session };
+        for _ in 0..MOST_WAITING {
+            outlet.send(Event::Reregistered);
+        }
+        outlet.send(Event::Message(proto::Message::default()));
+        outlet.send(Event::Disconnected);
+        for _ in 0..MOST_WAITING {
+            assert_eq!(stream.next().await, Some(Event::Reregistered));
+        }
+        assert_eq!(stream.next().await, Some(Event::Disconnected));
+        outlet.send(Event::Message(proto::Message::default()));
+        assert!(matches!(stream.next().await, Some(Event::Message(_))));
+    }
+}

@@ -1,0 +1,17 @@
+//! The link to the controller.
+//!
+//! | module | holds |
+//! |---|---|
+//! | [`kubeconfig`] | which controller is dialled, and as whom |
+//! | [`tls`] | the connection |
+//! | [`session`] | one stream at a time, made again whenever it breaks |
+//! | [`pending`] | calls without an answer yet |
+//! | [`seen`] | which updates were handed out before |
+//! | [`state`] | the framework's id, across runs of the program |
+
+pub(crate) mod kubeconfig;
+mod pending;
+mod seen;
+pub(crate) mod session;
+pub(crate) mod state;
+pub(crate) mod tls;

@@ -1,0 +1,62 @@
+//! Whom the framework believes, and who it says it is.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use hyper_util::rt::TokioIo;
+use rustls::crypto::ring;
+use rustls::pki_types::pem::PemObject as _;
+use rustls::pki_types::{CertificateDer, PrivateKeyDer, ServerName};
+use rustls::{CertificateError, ClientConfig, Error, RootCertStore};
+use tokio::net::TcpStream;
+use tokio_rustls::TlsConnector;
+use tokio_rustls::client::TlsStream;
+use tonic::transport::{Channel, Endpoint};
+
+use super::kubeconfig::Address;
+
+/// A connection in one building is up in milliseconds, over a bad radio link in seconds.
+const PATIENCE: Duration = Duration::from_secs(10);
+
+/// Believes the kubeconfig's CA and shows its client certificate.
+pub(crate) fn mutual(ca: &[u8], certificate: &[u8], key: &[u8]) -> Result<ClientConfig, Error> {
+    let bad = |_| Error::InvalidCertificate(CertificateError::BadEncoding);
+    let mut roots = RootCertStore::empty();
+    for authority in CertificateDer::pem_slice_iter(ca) {
+        roots.add(authority.map_err(bad)?)?;
+    }
+    let chain: Vec<CertificateDer<'static>> =
+        CertificateDer::pem_slice_iter(certificate).collect::<Result<_, _>>().map_err(bad)?;
+    let key = PrivateKeyDer::from_pem_slice(key).map_err(bad)?;
+    let mut config = ClientConfig::builder_with_provider(Arc::new(ring::default_provider()))
+        .with_safe_default_protocol_versions()?
+        .with_root_certificates(roots)
+        .with_client_auth_cert(chain, key)?;
+    config.alpn_protocols = vec![b"h2".to_vec()];
+    Ok(config)
+}
+
+/// An HTTP/2 connection to the controller.
+pub(crate) async fn dial(
+    address: &Address,
+    tls: &Arc<ClientConfig>,
+) -> Result<Channel, tonic::transport::Error> {
+    let endpoint = Endpoint::from_shared(format!("http://{address}"))?.connect_timeout(PATIENCE);
+    let (address, tls) = (address.clone(), Arc::clone(tls));
+    let connector = tower::service_fn(move |_: http::Uri| {
+        let (address, tls) = (address.clone(), Arc::clone(&tls));
+        async move { connect(&address, tls).await.map(TokioIo::new) }
+    });
+    endpoint.connect_with_connector(connector).await
+}
+
+async fn connect(
+    address: &Address,
+    tls: Arc<ClientConfig>,
+) -> std::io::Result<TlsStream<TcpStream>> {
+    let host = ServerName::try_from(address.host.clone()).map_err(std::io::Error::other)?;
+    let tcp = TcpStream::connect((address.host.as_str(), address.port)).await?;
+    // Calls are small, and somebody waits for each. Without it they are only slower.
+    let _ = tcp.set_nodelay(true);
+    TlsConnector::from(tls).connect(host, tcp).await
+}

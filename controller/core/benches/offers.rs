@@ -1,0 +1,264 @@
+//! Speed of the decisions: nearest robots beside brute force, a full cycle of offers, placements over a moving fleet.
+//!
+//! ```sh
+//! cargo bench -p muster-controller-core --bench offers
+//! ```
+
+use std::hint::black_box;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use muster_api::condition::{self, Condition, ConditionStatus};
+use muster_api::id::TaskUid;
+use muster_api::kind::framework::FrameworkSpec;
+use muster_api::kind::node::{Node, NodeKind, NodeSpec, NodeStatus, RuntimeStatus};
+use muster_api::kind::task::TaskSpec;
+use muster_api::name::NodeName;
+use muster_api::pose::{OperationPosition, Pose};
+use muster_api::quantity::{Bytes, MilliCpu};
+use muster_api::resource::{Compute, parse_function_list};
+use muster_controller_core::cluster::Cluster;
+use muster_controller_core::offer::Wish;
+use muster_controller_core::offer::allocator::Closest;
+use muster_controller_core::offer::book::Book;
+use muster_controller_core::schedule::{Demand, schedule};
+use muster_controller_core::space::{Slot, Space};
+use nalgebra::Point3;
+
+/// One robot for each 25 m² of floor.
+const SQUARE_METRES_PER_ROBOT: f64 = 25.0;
+const RADIUS: f64 = 25.0;
+const NEAREST: usize = 16;
+/// Moves between two queries.
+const MOVES: usize = 10;
+
+/// Numbers that look random and are the same in every run (splitmix64).
+struct Numbers(u64);
+
+impl Numbers {
+    fn next(&mut self) -> u64 {
+        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
+        let mut z = self.0;
+        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
+        z ^ (z >> 31)
+    }
+
+    fn below(&mut self, limit: f64) -> f64 {
+        (self.next() >> 11) as f64 / (1_u64 << 53) as f64 * limit
+    }
+
+    fn index(&mut self, length: usize) -> usize {
+        (self.next() % length as u64) as usize
+    }
+
+    fn point(&mut self, side: f64) -> Point3<f64> {
+        Point3::new(self.below(side), self.below(side), 0.0)
+    }
+}
+
+fn side(robots: usize) -> f64 {
+    (robots as f64 * SQUARE_METRES_PER_ROBOT).sqrt()
+}
+
+/// Half of the robots are filtered out.
+fn passes(slot: Slot) -> bool {
+    slot.is_multiple_of(2)
+}
+
+fn brute_force(robots: &[Point3<f64>], at: Point3<f64>) -> Vec<Slot> {
+    let mut found: Vec<(f64, Slot)> = (0_u32..)
+        .zip(robots)
+        .filter(|(slot, _)| passes(*slot))
+        .map(|(slot, p)| (nalgebra::distance(&at, p), slot))
+        .filter(|(distance, _)| *distance <= RADIUS)
+        .collect();
+    found.sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
+    found.truncate(NEAREST);
+    found.into_iter().map(|(_, slot)| slot).collect()
+}
+
+fn indexed(space: &Space, at: Point3<f64>) -> Vec<Slot> {
+    let nearest = space.nearest("map", at, RADIUS).map(|f| f.slot);
+    nearest.filter(|slot| passes(*slot)).take(NEAREST).collect()
+}
+
+fn nearest(robots: usize, queries: usize) {
+    let (mut numbers, side) = (Numbers(1), side(robots));
+    let mut places: Vec<Point3<f64>> = (0..robots).map(|_| numbers.point(side)).collect();
+    let mut space = Space::default();
+    for (slot, place) in (0_u32..).zip(&places) {
+        space.insert(slot, "map", *place);
+    }
+    let (mut by_index, mut by_scan) = (Duration::ZERO, Duration::ZERO);
+    for _ in 0..queries {
+        let at = numbers.point(side);
+        // A robot at 1 m/s whose pose comes ten times a second.
+        let moves: Vec<(usize, Point3<f64>)> = (0..MOVES)
+            .map(|_| {
+                let i = numbers.index(robots);
+                let step =
+                    nalgebra::Vector3::new(numbers.below(0.2) - 0.1, numbers.below(0.2) - 0.1, 0.0);
+                (i, places[i] + step)
+            })
+            .collect();
+        let start = Instant::now();
+        for (i, place) in &moves {
+            space.insert(*i as Slot, "map", *place);
+        }
+        let answer = indexed(&space, black_box(at));
+        by_index += start.elapsed();
+        let start = Instant::now();
+        for (i, place) in &moves {
+            places[*i] = *place;
+        }
+        let truth = brute_force(&places, black_box(at));
+        by_scan += start.elapsed();
+        assert_eq!(answer, truth, "the answers are the same");
+    }
+    println!(
+        "  {robots:>7} robots: {:>9.0} queries/s with {MOVES} moves each, brute force {:>7.0}: {:.0}×",
+        queries as f64 / by_index.as_secs_f64(),
+        queries as f64 / by_scan.as_secs_f64(),
+        by_scan.as_secs_f64() / by_index.as_secs_f64()
+    );
+}
+
+fn robot(at: Point3<f64>) -> Node {
+    let spec =
+        NodeSpec { kind: NodeKind::Robot, unschedulable: false, taints: Vec::new(), speed: None };
+    let mut node = Node::new("n", spec);
+    let functions = |text| parse_function_list(text).expect("functions").into_iter().collect();
+    node.status = Some(NodeStatus {
+        allocatable: Compute::new(MilliCpu(4000), Bytes(8 << 30)),
+        sensors: functions("kinect:ImageGen,LaserGen"),
+        actuators: functions("base:Drive"),
+        pose: Some(pose(at)),
+        conditions: vec![Condition {
+            r#type: condition::READY.to_owned(),
+            status: ConditionStatus::True,
+            reason: String::new(),
+            message: String::new(),
+            last_transition_time: None,
+        }],
+        runtimes: vec![RuntimeStatus {
+            name: "process".to_owned(),
+            available: true,
+            version: String::new(),
+            message: String::new(),
+        }],
+        ..NodeStatus::default()
+    });
+    node
+}
+
+fn pose(at: Point3<f64>) -> Pose {
+    Pose {
+        map: "map".to_owned(),
+        x: at.x,
+        y: at.y,
+        z: at.z,
+        yaw: 0.0,
+        stamp: None,
+        source: String::new(),
+        localized: true,
+    }
+}
+
+fn fleet(robots: usize, numbers: &mut Numbers) -> (Cluster, Vec<NodeName>, Vec<Point3<f64>>) {
+    let mut cluster = Cluster::new();
+    let (mut names, mut places) = (Vec::new(), Vec::new());
+    for i in 0..robots {
+        let place = numbers.point(side(robots));
+        let name = NodeName::new(format!("robot-{i}")).expect("a name");
+        cluster.upsert_node(&name, &robot(place));
+        names.push(name);
+        places.push(place);
+    }
+    (cluster, names, places)
+}
+
+fn position(at: Point3<f64>) -> OperationPosition {
+    OperationPosition { map: "map".to_owned(), x: at.x, y: at.y, z: at.z }
+}
+
+fn cycle(robots: usize, frameworks: usize) {
+    let mut numbers = Numbers(2);
+    let (mut cluster, names, mut places) = fleet(robots, &mut numbers);
+    let mut book = Book::new(Box::new(Closest));
+    let mut seats = Vec::new();
+    for i in 0..frameworks {
+        let spec = FrameworkSpec {
+            position: Some(position(numbers.point(side(robots)))),
+            radius: Some(RADIUS),
+            ..FrameworkSpec::default()
+        };
+        seats.push(book.register(Wish::new(&format!("team-{}", i % 10), &spec)));
+    }
+    let start = Instant::now();
+    let notices = book.refresh(&mut cluster, Duration::from_secs(1));
+    let first = start.elapsed();
+    let offers: usize = notices.values().map(|n| n.offered.len()).sum();
+    // Every robot moves, and everybody is looked at again.
+    for (name, place) in names.iter().zip(&mut places) {
+        *place += nalgebra::Vector3::new(numbers.below(0.2) - 0.1, numbers.below(0.2) - 0.1, 0.0);
+        cluster.set_pose(name, &pose(*place));
+    }
+    let start = Instant::now();
+    let again = book.refresh(&mut cluster, Duration::from_secs(2));
+    let moved = start.elapsed();
+    let changed: usize = again.values().map(|n| n.offered.len() + n.rescinded.len()).sum();
+    println!(
+        "  {robots} agents × {frameworks} frameworks: {offers} offers in {:.1} ms; after every robot moved {changed} \
+         changes in {:.1} ms",
+        first.as_secs_f64() * 1e3,
+        moved.as_secs_f64() * 1e3,
+    );
+}
+
+fn decisions(robots: usize, tasks: usize) {
+    let mut numbers = Numbers(3);
+    let (mut cluster, names, mut places) = fleet(robots, &mut numbers);
+    let mut spent = Duration::ZERO;
+    for i in 0..tasks {
+        let spec = serde_json::json!({
+            "placement": {"at": {"x": numbers.below(side(robots)), "y": numbers.below(side(robots))}, "within": RADIUS},
+            "resources": {"cpu": "100m", "memory": "64Mi", "sensors": ["kinect:ImageGen"]},
+            "run": {"process": {"command": ["true"]}},
+        });
+        let spec: TaskSpec = serde_json::from_value(spec).expect("a spec");
+        let uid = TaskUid::new(format!("task-{i}"));
+        let mut demand = [Demand {
+            uid: uid.clone(),
+            title: format!("default/task-{i}").into(),
+            spec: Arc::new(spec),
+            since: 0,
+        }];
+        let moved = numbers.index(robots);
+        places[moved] += nalgebra::Vector3::new(0.1, 0.0, 0.0);
+        let pose = pose(places[moved]);
+        let start = Instant::now();
+        cluster.set_pose(&names[moved], &pose);
+        let plan = schedule(&mut cluster, &mut demand);
+        spent += start.elapsed();
+        black_box(&plan);
+        // A fleet in use: half of the tasks stay.
+        if i % 2 == 0 {
+            cluster.release(&uid);
+        }
+    }
+    println!(
+        "  {robots} moving nodes, one thread: {:.0} decisions/s, each after a move",
+        tasks as f64 / spent.as_secs_f64()
+    );
+}
+
+fn main() {
+    println!("{NEAREST} nearest within {RADIUS} m, half of the robots filtered out:");
+    nearest(10_000, 20_000);
+    nearest(100_000, 2_000);
+    println!("offers:");
+    cycle(10_000, 1_000);
+    println!("placement:");
+    decisions(10_000, 40_000);
+}

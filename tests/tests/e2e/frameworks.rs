@@ -1,0 +1,154 @@
+//! Frameworks through the Python SDK, with real agents: Figure 4 of Avalon, and what happens when a framework dies.
+
+use std::collections::BTreeMap;
+
+use muster_api::phase::TaskPhase;
+use muster_tests::{AgentOptions, Cluster, Puppet, wait};
+use serde_json::{Value, json};
+
+fn spec(cpu: Option<&str>, sensors: &[&str], actuators: &[&str]) -> Value {
+    let mut resources = json!({"memory": "16Mi", "sensors": sensors, "actuators": actuators});
+    if let Some(cpu) = cpu {
+        resources["cpu"] = cpu.into();
+    }
+    json!({
+        "resources": resources,
+        "run": {"process": {"command": ["sh", "-c", "while :; do sleep 1; done"]}},
+        "gracePeriodSeconds": 0,
+    })
+}
+
+async fn two_robots() -> Cluster {
+    let mut cluster = Cluster::start().await;
+    for (name, x) in [("slave-1", 0.0), ("slave-2", 10.0)] {
+        let options = AgentOptions::robot(name, x, 0.0).flag("--cpu", "1").flag("--memory", "1Gi");
+        cluster.join(options).await;
+    }
+    cluster
+}
+
+fn cpu(offers: &BTreeMap<String, Value>, node: &str) -> Option<u64> {
+    offers.get(node)?["cpu"].as_u64()
+}
+
+fn list(offers: &BTreeMap<String, Value>, node: &str, what: &str) -> usize {
+    offers.get(node).and_then(|o| o[what].as_array()).map_or(0, Vec::len)
+}
+
+/// Steps 1 to 7 of Avalon, III-D: what is offered after each.
+#[tokio::test(flavor = "multi_thread")]
+async fn figure_4_of_avalon_with_frameworks() {
+    // 1: two robots report what they have and where they are.
+    let cluster = two_robots().await;
+
+    // 2 and 3: framework 1 says where it works, and is offered both, the nearest first.
+    let mut one =
+        Puppet::start(&cluster, json!({"name": "one", "position": [0.0, 0.0], "radius": 10.0}))
+            .await;
+    one.holds("both robots, whole", |o| {
+        cpu(o, "slave-1") == Some(1000) && cpu(o, "slave-2") == Some(1000)
+    })
+    .await;
+    assert_eq!(one.holding["slave-1"]["score"], 0.0);
+    assert_eq!(one.holding["slave-2"]["score"], 10.0, "the rim is inside");
+    assert_eq!(list(&one.holding, "slave-1", "actuators"), 2);
+
+    // 4 and 5: it launches task 1 and task 2 at once; each takes CR and all AR of its robot.
+    let launched = one
+        .launch(&[
+            ("slave-1", "task-1", spec(Some("600m"), &["kinect:LaserGen"], &["base:Drive"])),
+            ("slave-2", "task-2", spec(Some("1"), &["kinect:LaserGen"], &["arm:Grasp"])),
+        ])
+        .await;
+    assert_eq!(launched["event"], "launched", "{launched}");
+    for (task, node) in [("task-1", "slave-1"), ("task-2", "slave-2")] {
+        one.hears(task, "RUNNING").await;
+        let status = cluster.phase(task, TaskPhase::Running).await.status.expect("running");
+        assert_eq!(status.node.as_deref(), Some(node));
+        assert_eq!(status.lease.map(|l| (l.name, l.epoch.0)), Some((format!("{node}.body"), 1)));
+    }
+
+    // 6: framework 2, at the same position, is offered the remaining CR and all SR of slave 1, and all SR of slave 2.
+    let two = json!({"name": "two", "position": [0.0, 0.0], "radius": 10.0});
+    let mut two = Puppet::start(&cluster, two).await;
+    two.holds("what is left", |o| cpu(o, "slave-1") == Some(400) && cpu(o, "slave-2") == Some(0))
+        .await;
+    for node in ["slave-1", "slave-2"] {
+        assert_eq!(list(&two.holding, node, "sensors"), 2, "sensors are shared");
+        assert_eq!(list(&two.holding, node, "actuators"), 0, "actuators are held");
+    }
+    let refused =
+        two.launch(&[("slave-1", "second-driver", spec(None, &[], &["arm:Grasp"]))]).await;
+    assert_eq!(refused["reason"], "CONFLICT", "{refused}");
+
+    // 7: its two tasks, which need SR, are deployed beside the first ones.
+    two.holds("both again", |o| o.len() == 2).await;
+    let launched = two
+        .launch(&[
+            ("slave-1", "sr-1", spec(Some("300m"), &["kinect:ImageGen"], &[])),
+            ("slave-2", "sr-2", spec(None, &["kinect:ImageGen"], &[])),
+        ])
+        .await;
+    assert_eq!(launched["event"], "launched", "{launched}");
+    two.hears("sr-1", "RUNNING").await;
+    two.hears("sr-2", "RUNNING").await;
+
+    // A third that joins later gets the remaining CR and all SR of both robots.
+    let mut three = Puppet::start(&cluster, json!({"name": "three", "position": [5.0, 0.0]})).await;
+    three
+        .holds("the rest", |o| cpu(o, "slave-1") == Some(100) && cpu(o, "slave-2") == Some(0))
+        .await;
+    assert_eq!(list(&three.holding, "slave-2", "sensors"), 2);
+    // A declared task takes from the same books, and the third sees it at once.
+    cluster
+        .create(
+            "declared",
+            json!({"placement": {"node": "slave-1"}, "resources": {"cpu": "60m"},
+            "run": {"process": {"command": ["sleep", "1000"]}}}),
+        )
+        .await;
+    three.holds("less", |o| cpu(o, "slave-1") == Some(40)).await;
+
+    // Ended by its framework, a driver's robot is offered with its actuators again.
+    let task = launched_id(&cluster, "task-1").await;
+    one.order(json!({"do": "kill", "task": task, "grace": 0})).await;
+    one.hears("task-1", "FAILED").await;
+    three.holds("actuators", |o| list(o, "slave-1", "actuators") == 2).await;
+    one.order(json!({"do": "stop"})).await;
+    one.event("the end", |e| e["event"] == "ended").await;
+    three.holds("all but two's", |o| cpu(o, "slave-2") == Some(1000)).await;
+}
+
+async fn launched_id(cluster: &Cluster, task: &str) -> String {
+    let task = cluster.task(task, "there", |_| true).await;
+    task.metadata.uid.expect("a uid")
+}
+
+/// A framework that dies and comes back with its id finds its tasks as they were; one that stays away loses them.
+#[tokio::test(flavor = "multi_thread")]
+async fn a_framework_fails_over_or_its_tasks_end() {
+    let cluster = two_robots().await;
+    let info =
+        |id: &str, timeout: f64| json!({"name": "fragile", "id": id, "failover_timeout": timeout});
+    let mut first = Puppet::start(&cluster, info("", 600.0)).await;
+    first.holds("offers", |o| o.len() == 2).await;
+    let drive = spec(Some("100m"), &[], &["base:Drive"]);
+    let launched = first.launch(&[("slave-1", "driver", drive)]).await;
+    assert_eq!(launched["event"], "launched", "{launched}");
+    first.hears("driver", "RUNNING").await;
+    let before = cluster.phase("driver", TaskPhase::Running).await.status.expect("running");
+    first.kill().await;
+
+    let id = first.id.clone();
+    // Its timeout is short now: the next death is the last.
+    let mut again = Puppet::start(&cluster, info(&id, 0.2)).await;
+    again.hears("driver", "RUNNING").await;
+    let after = cluster.phase("driver", TaskPhase::Running).await.status.expect("running");
+    assert_eq!(before.started_at, after.started_at, "it was not started again");
+    again.kill().await;
+
+    let gone = wait::object(cluster.tasks().await, "driver", "gone", |t| t.is_none());
+    gone.await;
+    let mut late = Puppet::start(&cluster, json!({"name": "other"})).await;
+    late.holds("the robot's actuators", |o| list(o, "slave-1", "actuators") == 2).await;
+}
