@@ -232,12 +232,12 @@ impl Driver {
 
     /// Keeps the task's socket and what is known of it as an executor. Before anything is started,
     /// and after the kernel has shown an end.
-    fn attend(&mut self) {
+    async fn attend(&mut self) {
         let workload = &self.record.workload;
         if Kind::of(&self.record.assignment.spec) == Kind::Work {
             return;
         }
-        self.shared.desks.live(workload);
+        self.shared.desks.live(workload).await;
         if !workload.state.may_be_live() {
             self.seat = None;
         } else if self.seat.is_none() {
@@ -253,7 +253,7 @@ impl Driver {
     }
 
     async fn carry_out(&mut self, response: Response) {
-        self.attend();
+        self.attend().await;
         for effect in response.effects {
             match effect {
                 Effect::Persist => self.persist().await,

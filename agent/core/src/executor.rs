@@ -80,6 +80,11 @@ pub struct Work {
     pub began: Option<Wall>,
     /// The executor has said something of it.
     heard: bool,
+    /// The newest update that is accounted for. Its own: of several updates that came together, the
+    /// agent may have written down one and died before the next.
+    sequence: u64,
+    /// It was handed over, and whoever is connected now does not have it.
+    absent: bool,
     /// It is being ended; after this the executor is ended instead.
     pub until: Option<Boot>,
     /// Milliseconds that the executor was given to end it.
@@ -112,7 +117,7 @@ impl Work {
 pub struct Record {
     /// The executor's attempt that has it.
     pub life: u32,
-    /// The newest update of the executor that is accounted for.
+    /// The newest update that its end and begin account for.
     pub sequence: u64,
     /// When it was claimed.
     pub claimed: Wall,
@@ -208,6 +213,7 @@ pub enum Effect {
 pub struct Executor {
     life: Life,
     connected: bool,
+    /// The newest update that was heard.
     sequence: u64,
     works: BTreeMap<TaskUid, Work>,
 }
@@ -248,7 +254,7 @@ impl Executor {
         let work = self.works.get(work)?;
         Some(Record {
             life: self.life.attempt()?,
-            sequence: self.sequence,
+            sequence: work.sequence,
             claimed: work.claimed,
             heard: work.heard,
             began: work.began,
@@ -264,7 +270,7 @@ impl Executor {
     pub fn handle(&mut self, event: Event, now: Now) -> Vec<Effect> {
         let mut effects = Vec::new();
         match event {
-            Event::Life(life) => self.on_life(life, now),
+            Event::Life(life) => self.on_life(life, now, &mut effects),
             Event::Registered { works, unacknowledged } => {
                 self.on_registered(&works, unacknowledged, now, &mut effects);
             }
@@ -284,7 +290,7 @@ impl Executor {
         effects
     }
 
-    fn on_life(&mut self, life: Life, now: Now) {
+    fn on_life(&mut self, life: Life, now: Now, effects: &mut Vec<Effect>) {
         if life.attempt() != self.life.attempt() {
             // Nothing of the former attempt is left, and so nothing of its works.
             for work in self.works.values_mut().filter(|work| work.is_live()) {
@@ -293,6 +299,8 @@ impl Executor {
             (self.connected, self.sequence) = (false, 0);
         }
         self.life = life;
+        // It may have connected before its runtime said that it lives.
+        self.hand_over(effects);
     }
 
     fn claim(&mut self, uid: TaskUid, attempt: u32, stage: Stage, claimed: Wall) {
@@ -302,6 +310,9 @@ impl Executor {
             claimed,
             began: None,
             heard: false,
+            // What came before is of an earlier attempt.
+            sequence: self.sequence,
+            absent: false,
             until: None,
             grace_ms: 0,
             disconnected: false,
@@ -310,14 +321,29 @@ impl Executor {
     }
 
     fn on_recorded(&mut self, uid: &TaskUid, effects: &mut Vec<Effect>) {
-        let accepts = self.accepts();
-        let Some(work) = self.works.get_mut(uid) else { return };
-        if work.stage == Stage::Claimed {
-            work.stage = Stage::Recorded;
+        match self.works.get_mut(uid) {
+            Some(work) if work.stage == Stage::Claimed => work.stage = Stage::Recorded,
+            _ => return,
         }
-        if work.stage == Stage::Recorded && accepts {
-            work.stage = Stage::Sent;
+        self.hand_over(effects);
+    }
+
+    /// Hands over what the executor can take and does not have.
+    fn hand_over(&mut self, effects: &mut Vec<Effect>) {
+        if !self.accepts() {
+            return;
+        }
+        for (uid, work) in &mut self.works {
+            // An earlier hand-over may have been lost with its connection.
+            let lost = work.stage == Stage::Sent && work.absent && !work.heard;
+            if work.stage != Stage::Recorded && !lost {
+                continue;
+            }
+            (work.stage, work.absent) = (Stage::Sent, false);
             effects.push(Effect::Launch(uid.clone()));
+            if work.until.is_some() {
+                effects.push(Effect::Kill { work: uid.clone(), grace_ms: work.grace_ms });
+            }
         }
     }
 
@@ -330,6 +356,7 @@ impl Executor {
         }
         let Some(work) = self.works.get_mut(&uid) else { return };
         (work.began, work.heard) = (record.began, record.heard);
+        work.sequence = record.sequence;
         match record.exit {
             Some(exit) => work.stage = Stage::Ended(exit),
             None if !same => work.end(End::Lost(Loss::Executor), now),
@@ -346,8 +373,12 @@ impl Executor {
         effects: &mut Vec<Effect>,
     ) {
         self.connected = true;
-        let mut named = works.clone();
-        named.extend(unacknowledged.iter().map(|update| update.work.clone()));
+        // An update that is accounted for may be of an earlier attempt of the work.
+        let new = unacknowledged.iter().filter(|update| {
+            self.works.get(&update.work).is_some_and(|work| update.sequence > work.sequence)
+        });
+        let named: BTreeSet<TaskUid> =
+            works.iter().chain(new.map(|update| &update.work)).cloned().collect();
         for update in unacknowledged {
             self.on_update(update, now, effects);
         }
@@ -355,32 +386,24 @@ impl Executor {
             // Nobody here asks for it, and it must not go on.
             effects.push(Effect::Kill { work: uid.clone(), grace_ms: 0 });
         }
-        let accepts = self.accepts();
         for (uid, work) in &mut self.works {
-            match work.stage {
-                Stage::Recorded if accepts => {
-                    work.stage = Stage::Sent;
-                    effects.push(Effect::Launch(uid.clone()));
-                }
-                Stage::Sent | Stage::Running if !named.contains(uid) && work.heard => {
-                    work.end(End::Lost(Loss::Executor), now);
-                }
-                // The hand-over may have been lost with the connection.
-                Stage::Sent if !named.contains(uid) && accepts => {
-                    effects.push(Effect::Launch(uid.clone()));
-                }
-                _ => {}
+            if !matches!(work.stage, Stage::Sent | Stage::Running) {
+                continue;
             }
-            if work.until.is_some() && work.is_live() {
+            work.absent = !named.contains(uid);
+            if work.absent && work.heard {
+                work.end(End::Lost(Loss::Executor), now);
+            } else if !work.absent && work.until.is_some() {
                 effects.push(Effect::Kill { work: uid.clone(), grace_ms: work.grace_ms });
             }
         }
+        self.hand_over(effects);
     }
 
     fn on_update(&mut self, update: Update, now: Now, effects: &mut Vec<Effect>) {
         let Update { work: uid, sequence, state } = update;
         if let Some(work) = self.works.get_mut(&uid) {
-            if sequence > self.sequence && matches!(work.stage, Stage::Sent | Stage::Running) {
+            if sequence > work.sequence && matches!(work.stage, Stage::Sent | Stage::Running) {
                 work.heard = true;
                 match state {
                     WorkState::Starting => {}
@@ -391,6 +414,7 @@ impl Executor {
                     WorkState::Over(end) => work.end(end, now),
                 }
             }
+            work.sequence = work.sequence.max(sequence);
             // Also for one that was heard before: its record may still be under way.
             effects.push(Effect::Record(uid));
         }
@@ -416,7 +440,9 @@ impl Executor {
         if work.until.is_none_or(|before| until < before) {
             (work.until, work.grace_ms) = (Some(until), grace_ms);
         }
-        if self.connected {
+        // One that it does not have is ended as soon as it was handed over: it may answer for what
+        // it does not know, and must not get it after that.
+        if self.connected && !work.absent {
             effects.push(Effect::Kill { work: uid.clone(), grace_ms: work.grace_ms });
         }
     }
@@ -545,6 +571,20 @@ mod tests {
         let _ = executor.handle(said("b", 8, WorkState::Starting), at(4));
         assert!(executor.handle(registered(&[]), at(5)).is_empty());
         assert_eq!(end_of(&executor, "b"), Some(End::Lost(Loss::Executor)), "it had it");
+    }
+
+    #[test]
+    fn who_comes_back_before_it_is_known_to_live_gets_its_works_then() {
+        let record = busy().record(&uid("a")).expect("it is there");
+        let mut executor = Executor::new(Life::Unsure(1));
+        let _ = executor.handle(Event::Adopted(uid("a"), 1, record), at(1));
+        assert!(executor.handle(registered(&[]), at(2)).is_empty());
+        let stop = Event::Stop { work: uid("a"), grace_ms: 9, disconnected: false };
+        assert!(executor.handle(stop, at(3)).is_empty());
+        let effects = executor.handle(Event::Life(Life::Live(1)), at(4));
+        let kill = Effect::Kill { work: uid("a"), grace_ms: 9 };
+        assert_eq!(effects, [Effect::Launch(uid("a")), kill]);
+        assert!(executor.handle(Event::Life(Life::Live(1)), at(5)).is_empty());
     }
 
     #[test]

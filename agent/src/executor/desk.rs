@@ -61,6 +61,20 @@ struct Desk {
     out: Option<Arc<Queue<proto::Event>>>,
     handed: BTreeMap<TaskUid, Handed>,
     room: Arc<Room>,
+    /// Held while a record is taken and written: an older one never replaces a newer one.
+    writing: Arc<tokio::sync::Mutex<()>>,
+}
+
+impl Desk {
+    /// Takes note of where its task is; whether that was known.
+    fn learn(&mut self, life: Life, over: bool) -> bool {
+        let known = (self.machine.life(), self.over) == (life, over);
+        if self.machine.life().attempt() != life.attempt() {
+            (self.out, self.registered_before) = (None, false);
+        }
+        self.over = over;
+        known
+    }
 }
 
 /// What an executor is told of a work, and what the work brings.
@@ -115,6 +129,7 @@ impl Desks {
             out: None,
             handed: BTreeMap::new(),
             room: Arc::new(Room::new(room.0, room.1)),
+            writing: Arc::default(),
         });
     }
 
@@ -142,7 +157,7 @@ impl Desks {
     }
 
     /// Where the task of a possible executor is now.
-    pub(crate) fn live(&self, workload: &Workload) {
+    pub(crate) async fn live(&self, workload: &Workload) {
         let attempt = workload.attempt;
         let life = match workload.state {
             State::Launching | State::Running { .. } => Life::Live(attempt),
@@ -151,19 +166,13 @@ impl Desks {
             _ => Life::Gone,
         };
         let over = matches!(workload.state, State::Ended | State::Removing { .. });
-        let mut desks = self.desks();
-        let Some(desk) = desks.get_mut(&workload.uid) else { return };
-        if (desk.machine.life(), desk.over) == (life, over) {
-            return;
+        let known = match self.desks().get_mut(&workload.uid) {
+            Some(desk) => desk.learn(life, over),
+            None => return,
+        };
+        if !known {
+            self.handle(&workload.uid, Event::Life(life)).await;
         }
-        if desk.machine.life().attempt() != life.attempt() {
-            (desk.out, desk.registered_before) = (None, false);
-        }
-        desk.over = over;
-        // The end of a life asks for nothing.
-        let _ = desk.machine.handle(Event::Life(life), clock::now());
-        drop(desks);
-        self.changed.send_replace(());
     }
 
     /// The task is to end within `grace_ms`: a well-meaning executor ends its works itself.
@@ -266,6 +275,9 @@ impl Desks {
     /// Makes what is known of a work durable; does not give up.
     pub(super) async fn write_down(&self, executor: &TaskUid, work: &TaskUid) {
         loop {
+            let writing = self.desks().get(executor).map(|desk| Arc::clone(&desk.writing));
+            let Some(writing) = writing else { return };
+            let turn = writing.lock_owned().await;
             let file = self.desks().get(executor).and_then(|desk| {
                 let (record, attempt) =
                     (desk.machine.record(work)?, desk.machine.work(work)?.attempt);
@@ -273,7 +285,11 @@ impl Desks {
             });
             let Some(file) = file else { return };
             let path = self.path(work);
-            let write = move || durable::write_json(&path, &file, Keep::PowerCut);
+            let write = move || {
+                // Until it is written, whoever waits for it.
+                let _turn = turn;
+                durable::write_json(&path, &file, Keep::PowerCut)
+            };
             match tokio::task::spawn_blocking(write).await {
                 Ok(Ok(())) => return,
                 Ok(Err(error)) => {
@@ -313,6 +329,8 @@ impl Desks {
         let mut desks = self.desks();
         let desk = desks.get_mut(uid)?;
         desk.machine.life().attempt()?;
+        // A former connection may have been dropped without a word; nothing follows from it.
+        let _ = desk.machine.handle(Event::Disconnected, clock::now());
         let greeting = proto::Registered {
             executor: uid.to_string(),
             namespace: desk.namespace.clone(),

@@ -25,7 +25,8 @@ impl Executor {
         let stream =
             until("an executor's socket", || UnixStream::connect(dir.join("executor/socket")).ok());
         stream.set_read_timeout(Some(super::PATIENCE)).unwrap();
-        let record = std::fs::read(dir.join("task.json")).unwrap();
+        // The socket is there before the first record is.
+        let record = until("the task's record", || std::fs::read(dir.join("task.json")).ok());
         let record: serde_json::Value = serde_json::from_slice(&record).unwrap();
         let mut executor = Executor { stream, sequence: 0 };
         executor.say(Say::Register(proto::Register {
