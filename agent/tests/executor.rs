@@ -163,5 +163,25 @@ fn who_does_not_end_its_work_is_ended() {
         assert_eq!(controller.wait_end(work).reason, "ExecutorLost");
         assert!(!lives(pid), "{work} ended before its executor");
     }
-    assert_eq!(controller.wait_end("exec").signal, Some(9));
+    assert!(controller.wait_end("exec").signal.is_some());
+}
+
+#[test]
+fn only_who_has_the_token_is_the_executor() {
+    let controller = Controller::start();
+    let agent = Agent::start(&controller);
+    let mut executor = two_works(&controller, &agent);
+    let mut stranger = Executor::dial(&agent, "exec");
+    stranger.show(&"0".repeat(32), &[]);
+    assert!(stranger.is_closed());
+    let mut hasty = Executor::dial(&agent, "exec");
+    hasty.say(Say::Message(proto::Message { data: "first".into() }));
+    assert!(hasty.is_closed());
+    // Neither disturbed it; who has the token takes its place.
+    executor.update("w1", TaskState::Running);
+    let mut next = Executor::register(&agent, "exec", &["w1", "w2"]).after(&executor);
+    assert!(executor.is_closed());
+    next.update("w1", TaskState::Succeeded);
+    assert_eq!(controller.wait_end("w1").phase(), TaskPhase::Succeeded);
+    assert!(controller.messages().is_empty());
 }

@@ -18,22 +18,32 @@ pub struct Executor {
 }
 
 impl Executor {
-    /// Connects as the executor of the task `uid`, once it listens.
+    /// Connects to the socket of the task `uid`, once it listens.
     #[track_caller]
-    pub fn register(agent: &Agent, uid: &str, works: &[&str]) -> Executor {
-        let dir = agent.task_dir(uid);
-        let stream =
-            until("an executor's socket", || UnixStream::connect(dir.join("executor/socket")).ok());
+    pub fn dial(agent: &Agent, uid: &str) -> Executor {
+        let socket = agent.task_dir(uid).join("executor/socket");
+        let stream = until("an executor's socket", || UnixStream::connect(&socket).ok());
         stream.set_read_timeout(Some(super::PATIENCE)).unwrap();
-        // The socket is there before the first record is.
-        let record = until("the task's record", || std::fs::read(dir.join("task.json")).ok());
-        let record: serde_json::Value = serde_json::from_slice(&record).unwrap();
-        let mut executor = Executor { stream, sequence: 0 };
-        executor.say(Say::Register(proto::Register {
-            token: record["token"].as_str().unwrap().to_owned(),
+        Executor { stream, sequence: 0 }
+    }
+
+    pub fn show(&mut self, token: &str, works: &[&str]) {
+        self.say(Say::Register(proto::Register {
+            token: token.to_owned(),
             tasks: works.iter().map(|work| (*work).to_owned()).collect(),
             unacknowledged: Vec::new(),
         }));
+    }
+
+    /// Connects as the executor of the task `uid`.
+    #[track_caller]
+    pub fn register(agent: &Agent, uid: &str, works: &[&str]) -> Executor {
+        let mut executor = Executor::dial(agent, uid);
+        // The socket is there before the first record is.
+        let path = agent.task_dir(uid).join("task.json");
+        let record = until("the task's record", || std::fs::read(&path).ok());
+        let record: serde_json::Value = serde_json::from_slice(&record).unwrap();
+        executor.show(record["token"].as_str().unwrap(), works);
         let Heard::Registered(greeting) = executor.hear() else { panic!("no greeting") };
         assert_eq!((greeting.executor.as_str(), greeting.node.as_str()), (uid, "robot-1"));
         executor
@@ -85,6 +95,9 @@ impl Executor {
 
     /// Whether the agent has closed the connection.
     pub fn is_closed(&mut self) -> bool {
-        matches!(self.stream.read(&mut [0]), Ok(0) | Err(_))
+        match self.stream.read(&mut [0]) {
+            Ok(read) => read == 0,
+            Err(error) => error.kind() == std::io::ErrorKind::ConnectionReset,
+        }
     }
 }
