@@ -185,3 +185,22 @@ fn only_who_has_the_token_is_the_executor() {
     assert_eq!(controller.wait_end("w1").phase(), TaskPhase::Succeeded);
     assert!(controller.messages().is_empty());
 }
+
+#[test]
+fn a_work_of_which_nothing_was_said_ends_without_contact_too() {
+    let controller = Controller::start();
+    let agent = Agent::start(&controller);
+    assign_executor(&controller);
+    let mut executor = Executor::register(&agent, "exec", &[]);
+    let spec = json!({
+        "run": { "executor": { "task": "exec", "data": {} } },
+        "onDisconnect": { "policy": "Stop", "after": "1s" },
+    });
+    assign(&controller, "tied", &spec);
+    assert_eq!(executor.launched().task, "tied");
+    controller.set_away(true);
+    assert!(matches!(executor.hear(), Heard::Kill(kill) if kill.task == "tied"));
+    executor.update("tied", TaskState::Killed);
+    controller.set_away(false);
+    assert_eq!(controller.wait_end("tied").reason, "Disconnected");
+}

@@ -13,6 +13,7 @@ use muster_agent_core::observed::{End, Exit, Loss, Observed, Started};
 use muster_agent_core::time::Boot;
 use muster_agent_core::workload::Failure;
 use muster_api::id::TaskUid;
+use tokio::sync::watch;
 
 use super::desk::{Choice, Desks};
 use crate::clock;
@@ -62,6 +63,7 @@ impl WorkRuntime {
         }
         self.desks.write_down(&executor, uid).await;
         self.desks.handle(&executor, Event::Recorded(uid.clone())).await;
+        let mut told = false;
         loop {
             let Some((_, work, _)) = self.desks.look(&launch.id) else {
                 return Launched::Ended(lost());
@@ -72,7 +74,9 @@ impl WorkRuntime {
                     self.refit(&executor).await;
                     return Launched::Ended(exit);
                 }
-                Stage::Claimed | Stage::Recorded | Stage::Sent => drop(changes.changed().await),
+                Stage::Claimed | Stage::Recorded | Stage::Sent => {
+                    self.attend(launch, (&executor, &work), &mut told, &mut changes).await;
+                }
             }
         }
     }
@@ -108,25 +112,38 @@ impl WorkRuntime {
                 self.refit(&executor).await;
                 return exit;
             }
-            let contact = launch
-                .stop_after_ms
-                .filter(|_| !told)
-                .map(|limit| self.contact.last().unwrap_or_default().plus(limit));
-            let now = clock::boot();
-            if contact.is_some_and(|limit| now >= limit) {
-                told = true;
-                let grace_ms = launch.grace_ms;
-                let stop = Event::Stop { work: id.uid.clone(), grace_ms, disconnected: true };
-                self.desks.handle(&executor, stop).await;
-            } else if work.until.is_some_and(|until| now >= until) {
-                self.desks.handle(&executor, Event::Tick(id.uid.clone())).await;
-            } else {
-                let next = [contact, work.until].into_iter().flatten().min();
-                // Cancel-safe: a receiver and a sleep whose deadline is kept.
-                tokio::select! {
-                    changed = changes.changed() => drop(changed),
-                    () = sleep_until(next, now) => {}
-                }
+            self.attend(launch, (&executor, &work), &mut told, &mut changes).await;
+        }
+    }
+
+    /// Waits for a change, or does what is due: contact that was lost for too long ends a work, once
+    /// (`told`), and what does not end in time ends with its executor. Also of a work that was only
+    /// handed over: it may run.
+    async fn attend(
+        &self,
+        launch: &Launch,
+        (executor, work): (&TaskUid, &Work),
+        told: &mut bool,
+        changes: &mut watch::Receiver<()>,
+    ) {
+        let contact = launch
+            .stop_after_ms
+            .filter(|_| !*told)
+            .map(|limit| self.contact.last().unwrap_or_default().plus(limit));
+        let (uid, now) = (launch.id.uid.clone(), clock::boot());
+        if contact.is_some_and(|limit| now >= limit) {
+            *told = true;
+            let grace_ms = launch.grace_ms;
+            let stop = Event::Stop { work: uid, grace_ms, disconnected: true };
+            self.desks.handle(executor, stop).await;
+        } else if work.until.is_some_and(|until| now >= until) {
+            self.desks.handle(executor, Event::Tick(uid)).await;
+        } else {
+            let next = [contact, work.until].into_iter().flatten().min();
+            // Cancel-safe: a receiver and a sleep whose deadline is kept.
+            tokio::select! {
+                changed = changes.changed() => drop(changed),
+                () = sleep_until(next, now) => {}
             }
         }
     }

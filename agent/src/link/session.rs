@@ -207,8 +207,8 @@ impl Session<'_> {
         let mut last_heard = Instant::now();
         loop {
             // Every arm is cancel-safe: a stream's next message stays in the stream, a permit that
-            // was stored stays stored, a message stays queued, a tick and a join are taken whole or not at all. What an arm
-            // sends, it sends before the next wait.
+            // was stored stays stored, a message stays queued, a tick and a join are taken whole or
+            // not at all. What an arm sends, it sends before the next wait.
             tokio::select! {
                 message = heard.message() => {
                     last_heard = Instant::now();
