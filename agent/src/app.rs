@@ -25,6 +25,8 @@ use crate::config::{Args, Config, ConfigError, Identity, Kind};
 use crate::contact::Contact;
 use crate::driver::{Shared, chain};
 use crate::durable::FileError;
+use crate::executor::desk::Desks;
+use crate::executor::work::WorkRuntime;
 use crate::footprint;
 use crate::link::join::{self, Credentials, JoinError};
 use crate::link::session::{Command, Link};
@@ -236,9 +238,14 @@ pub async fn serve(
     if let Err(error) = tokio::task::spawn_blocking(move || sweeper.sweep()).await {
         tracing::error!(%error, "leftovers were not swept");
     }
+    let contact = Arc::new(Contact::open(&contact_file, &boot_id)?);
+    let desks = Arc::new(Desks::new(checkpoint.clone(), name.clone()));
+    let works = WorkRuntime { desks: Arc::clone(&desks), contact: Arc::clone(&contact) };
     let shared = Arc::new(Shared {
         node: name,
-        contact: Contact::open(&contact_file, &boot_id)?,
+        contact,
+        desks,
+        works: Arc::new(works) as Arc<dyn Runtime>,
         boot_id,
         checkpoint,
         board: Board::default(),
@@ -250,6 +257,7 @@ pub async fn serve(
     let node = Node::new(&config, facts, Arc::clone(&shared));
     let mut supervisor = Supervisor::new(Arc::clone(&shared));
     tracing::info!(node = %shared.node, tasks = records.len(), "started");
+    shared.restore(&records)?;
     supervisor.restore(records);
 
     let (commands, mut received) = mpsc::channel(16);

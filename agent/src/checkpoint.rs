@@ -28,8 +28,23 @@ pub(crate) struct Assignment {
 pub(crate) struct Record {
     /// The boot that the workload's times belong to.
     pub(crate) boot_id: String,
+    /// What the task shows at its executor socket. Records of before executors have none, and
+    /// neither do their processes.
+    #[serde(default = "token")]
+    pub(crate) token: String,
     pub(crate) assignment: Assignment,
     pub(crate) workload: Workload,
+}
+
+impl Record {
+    pub(crate) fn new(boot_id: &str, assignment: Assignment, workload: Workload) -> Record {
+        Record { boot_id: boot_id.to_owned(), token: token(), assignment, workload }
+    }
+}
+
+/// One that nobody guesses.
+pub(crate) fn token() -> String {
+    uuid::Uuid::new_v4().simple().to_string()
 }
 
 /// The directory of all tasks.

@@ -26,6 +26,9 @@ use crate::checkpoint::{Assignment, Checkpoint, Record};
 use crate::clock;
 use crate::contact::Contact;
 use crate::durable::FileError;
+use crate::executor;
+use crate::executor::desk::Desks;
+use crate::executor::seat::Seat;
 use crate::runtime::{AttemptId, Launch, Launched, Runtime};
 use crate::spec::{self, Kind, Surroundings};
 
@@ -40,11 +43,61 @@ pub(crate) struct Shared {
     pub(crate) boot_id: String,
     pub(crate) checkpoint: Checkpoint,
     pub(crate) board: Board,
-    pub(crate) contact: Contact,
+    pub(crate) contact: Arc<Contact>,
+    pub(crate) desks: Arc<Desks>,
     pub(crate) process: Arc<dyn Runtime>,
     pub(crate) docker: Arc<dyn Runtime>,
+    pub(crate) works: Arc<dyn Runtime>,
     /// Memory that tasks may reserve, bytes.
     pub(crate) allocatable_memory: u64,
+}
+
+impl Shared {
+    /// Which runtime runs a task.
+    fn runtime(&self, record: &Record) -> &Arc<dyn Runtime> {
+        match Kind::of(&record.assignment.spec) {
+            Kind::Process => &self.process,
+            Kind::Docker => &self.docker,
+            Kind::Work => &self.works,
+        }
+    }
+
+    fn launch(&self, record: &Record) -> Launch {
+        let workload = &record.workload;
+        let reserved = record.assignment.spec.resources.memory.map_or(0, |memory| memory.0);
+        let task_dir = self.checkpoint.task_dir(&workload.uid);
+        let others = self.board.reserved().saturating_sub(reserved);
+        let around = Surroundings {
+            node: &self.node,
+            task_dir: &task_dir,
+            token: &record.token,
+            unreserved: self.allocatable_memory.saturating_sub(others),
+        };
+        let id = AttemptId { uid: workload.uid.clone(), attempt: workload.attempt };
+        spec::launch(id, &record.assignment, &around)
+    }
+
+    fn enrol(&self, record: &Record) {
+        if Kind::of(&record.assignment.spec) != Kind::Work {
+            let room = (Arc::clone(self.runtime(record)), self.launch(record).limits);
+            self.desks.enrol(&record.assignment, &record.workload, room);
+        }
+    }
+
+    /// Tasks of an earlier life of the agent: all executors, and then their works. Before any driver
+    /// begins: an executor may speak of its works as soon as it can connect.
+    pub(crate) fn restore(&self, records: &[Record]) -> Result<(), FileError> {
+        for record in records {
+            self.enrol(record);
+        }
+        let works = records.iter().filter(|record| {
+            Kind::of(&record.assignment.spec) == Kind::Work && record.workload.state.may_be_live()
+        });
+        for record in works {
+            self.desks.adopt(&self.launch(record))?;
+        }
+        Ok(())
+    }
 }
 
 /// What the supervisor tells a driver.
@@ -67,6 +120,8 @@ pub(crate) struct Driver {
     operations: FuturesUnordered<Operation>,
     wakes: BTreeSet<Boot>,
     prepare: Option<AbortHandle>,
+    /// While processes of the task may exist: it may be an executor.
+    seat: Option<Seat>,
     dropped: bool,
 }
 
@@ -105,17 +160,16 @@ pub(crate) async fn drive(
         Begin::New(uid, assignment, desired) => {
             let fetch = spec::fetch(&assignment.spec);
             let (workload, response) = Workload::assigned(uid, desired, fetch, context);
-            let boot_id = shared.boot_id.clone();
-            (Record { boot_id, assignment: *assignment, workload }, response)
+            (Record::new(&shared.boot_id, *assignment, workload), response)
         }
         Begin::Unreadable(uid, assignment, why) => {
             let (workload, response) = Workload::unreadable(uid, why, context);
-            let boot_id = shared.boot_id.clone();
-            (Record { boot_id, assignment: *assignment, workload }, response)
+            (Record::new(&shared.boot_id, *assignment, workload), response)
         }
         Begin::Restored(record, response) => (*record, response),
     };
-    let runtime = Arc::clone(runtime(&shared, &record));
+    shared.enrol(&record);
+    let runtime = Arc::clone(shared.runtime(&record));
     let mut driver = Driver {
         shared,
         runtime,
@@ -124,21 +178,15 @@ pub(crate) async fn drive(
         operations: FuturesUnordered::new(),
         wakes: BTreeSet::new(),
         prepare: None,
+        seat: None,
         dropped: false,
     };
     driver.carry_out(response).await;
     driver.run().await;
 }
 
-fn runtime<'a>(shared: &'a Shared, record: &Record) -> &'a Arc<dyn Runtime> {
-    match Kind::of(&record.assignment.spec) {
-        Kind::Process => &shared.process,
-        Kind::Docker => &shared.docker,
-    }
-}
-
 fn publish(shared: &Shared, record: &Record) {
-    let (workload, runtime) = (&record.workload, runtime(shared, record));
+    let (workload, runtime) = (&record.workload, shared.runtime(record));
     let reserved = record.assignment.spec.resources.memory.map_or(0, |memory| memory.0);
     let board = &shared.board;
     board.publish(&workload.uid, &workload.report, workload.attempt, runtime, reserved);
@@ -182,7 +230,30 @@ impl Driver {
         AttemptId { uid: workload.uid.clone(), attempt: workload.attempt }
     }
 
+    /// Keeps the task's socket and what is known of it as an executor. Before anything is started,
+    /// and after the kernel has shown an end.
+    async fn attend(&mut self) {
+        let workload = &self.record.workload;
+        if Kind::of(&self.record.assignment.spec) == Kind::Work {
+            return;
+        }
+        self.shared.desks.live(workload).await;
+        if !workload.state.may_be_live() {
+            self.seat = None;
+        } else if self.seat.is_none() {
+            let dir = self.shared.checkpoint.task_dir(&workload.uid).join(executor::DIR);
+            let (desks, token) = (Arc::clone(&self.shared.desks), self.record.token.clone());
+            match Seat::open(desks, workload.uid.clone(), &dir, token) {
+                Ok(seat) => self.seat = Some(seat),
+                Err(error) => {
+                    tracing::warn!(uid = %workload.uid, %error, "no executor socket for this task");
+                }
+            }
+        }
+    }
+
     async fn carry_out(&mut self, response: Response) {
+        self.attend().await;
         for effect in response.effects {
             match effect {
                 Effect::Persist => self.persist().await,
@@ -205,11 +276,12 @@ impl Driver {
                     tracing::debug!(attempt, "prepare");
                     self.operations.push(event.boxed());
                 }
-                Effect::Launch(_)
-                | Effect::Watch(_)
-                | Effect::Find(_)
-                | Effect::Stop { .. }
-                | Effect::Remove => {
+                Effect::Stop { grace_ms, .. } => {
+                    self.shared.desks.shut_down(&self.record.workload.uid, grace_ms);
+                    let operation = self.operation(effect);
+                    self.operations.push(operation);
+                }
+                Effect::Launch(_) | Effect::Watch(_) | Effect::Find(_) | Effect::Remove => {
                     let operation = self.operation(effect);
                     self.operations.push(operation);
                 }
@@ -285,15 +357,7 @@ impl Driver {
     }
 
     fn launch(&self) -> Launch {
-        let reserved = self.record.assignment.spec.resources.memory.map_or(0, |memory| memory.0);
-        let task_dir = self.shared.checkpoint.task_dir(&self.record.workload.uid);
-        let others = self.shared.board.reserved().saturating_sub(reserved);
-        let around = Surroundings {
-            node: &self.shared.node,
-            task_dir: &task_dir,
-            unreserved: self.shared.allocatable_memory.saturating_sub(others),
-        };
-        spec::launch(self.id(), &self.record.assignment, &around)
+        self.shared.launch(&self.record)
     }
 
     async fn persist(&mut self) {
@@ -312,6 +376,7 @@ impl Driver {
             // Without its record it is swept at the next start; with it, it is removed then.
             tracing::warn!(id = %self.id(), error = chain(&error), "the task's files stay behind");
         }
+        self.shared.desks.dismiss(&self.record.workload.uid);
         self.dropped = true;
     }
 }
@@ -374,12 +439,15 @@ mod tests {
 
     fn shared(dir: &tempfile::TempDir, fake: &Arc<Fake>) -> Arc<Shared> {
         let checkpoint = Checkpoint::open(dir.path()).unwrap();
+        let desks = Arc::new(Desks::new(checkpoint.clone(), "n".to_owned()));
         Arc::new(Shared {
             node: "n".to_owned(),
             boot_id: "b".to_owned(),
             checkpoint,
             board: Board::default(),
-            contact: Contact::open(&dir.path().join("contact"), "b").unwrap(),
+            contact: Arc::new(Contact::open(&dir.path().join("contact"), "b").unwrap()),
+            desks,
+            works: Arc::clone(fake) as Arc<dyn Runtime>,
             process: Arc::clone(fake) as Arc<dyn Runtime>,
             docker: Arc::clone(fake) as Arc<dyn Runtime>,
             allocatable_memory: 1 << 30,

@@ -14,6 +14,7 @@
 //! | `supervisor`, `driver` | what `muster-agent-core` decides, carried out |
 //! | `checkpoint`, `durable` | what survives the agent |
 //! | `board` | what tasks show of themselves |
+//! | `executor` | tasks that run other tasks, over a socket of their own |
 //! | `footprint` | memory that is given back after the start |
 //! | `contact` | when the controller was last heard, for the shims too |
 //! | `link` | joining, the session, logs on request |
@@ -30,6 +31,7 @@ mod contact;
 mod declared;
 mod driver;
 mod durable;
+mod executor;
 mod footprint;
 mod link;
 mod node;

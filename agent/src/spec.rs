@@ -10,7 +10,10 @@ use muster_api::wire::WireError;
 use muster_api::wire::agent_session::spec_from_wire;
 
 use crate::checkpoint::Assignment;
-use crate::runtime::launch::{AttemptId, Container, Launch, Limits, Mount, Network, Program, Pull};
+use crate::executor;
+use crate::runtime::launch::{
+    AttemptId, Container, Launch, Lease, Limits, Mount, Network, Program, Pull, Work,
+};
 
 /// Processes and threads of a task that names no limit: enough for a large ROS graph, and far from
 /// what a fork bomb needs to take a robot down.
@@ -24,17 +27,23 @@ const MIN_MEMORY_CAP: u64 = 16 << 20;
 pub(crate) enum Kind {
     Process,
     Docker,
+    Work,
 }
 
 impl Kind {
     pub(crate) fn of(spec: &TaskSpec) -> Kind {
-        if spec.run.container.is_some() { Kind::Docker } else { Kind::Process }
+        match (&spec.run.container, &spec.run.executor) {
+            (Some(_), _) => Kind::Docker,
+            (None, Some(_)) => Kind::Work,
+            (None, None) => Kind::Process,
+        }
     }
 }
 
 /// What its runtime may have to fetch for it.
 pub(crate) fn fetch(spec: &TaskSpec) -> Fetch {
     match &spec.run.container {
+        None if spec.run.executor.is_some() => Fetch::Executor,
         None => Fetch::Nothing,
         Some(run) if run.pull_policy == task::PullPolicy::Always => Fetch::Always,
         Some(_) => Fetch::Missing,
@@ -44,8 +53,9 @@ pub(crate) fn fetch(spec: &TaskSpec) -> Fetch {
 /// A spec as an assignment carries it. One that names no runtime of this agent cannot be read.
 pub(crate) fn read(bytes: &[u8]) -> Result<TaskSpec, WireError> {
     let spec = spec_from_wire(bytes)?;
-    if spec.run.process.is_none() && spec.run.container.is_none() {
-        let none = "run: this agent runs process and container, and neither is there";
+    let run = &spec.run;
+    if run.process.is_none() && run.container.is_none() && run.executor.is_none() {
+        let none = "run: this agent runs process, container and executor, and none is there";
         return Err(WireError::invalid("assignment.spec", none));
     }
     Ok(spec)
@@ -78,6 +88,8 @@ pub(crate) struct Surroundings<'a> {
     pub(crate) node: &'a str,
     /// The task's own directory.
     pub(crate) task_dir: &'a Path,
+    /// What the task shows at its executor socket.
+    pub(crate) token: &'a str,
     /// Memory that nobody reserved, bytes.
     pub(crate) unreserved: u64,
 }
@@ -85,25 +97,14 @@ pub(crate) struct Surroundings<'a> {
 /// What a runtime needs to know.
 pub(crate) fn launch(id: AttemptId, assignment: &Assignment, around: &Surroundings<'_>) -> Launch {
     let spec = &assignment.spec;
+    let (program, variables) = program(assignment);
     let resources = &spec.resources;
-    let io = resources.io.clone().unwrap_or_default();
-    let (program, variables) = program(spec);
     let mut env = environment(&id, assignment, around);
     env.extend(variables);
     Launch {
         program,
         env,
-        limits: Limits {
-            cpu_millis: resources.cpu.map(|cpu| cpu.0),
-            memory_bytes: Some(
-                resources
-                    .memory
-                    .map_or_else(|| around.unreserved.max(MIN_MEMORY_CAP), |memory| memory.0),
-            ),
-            pids: Some(resources.pids.unwrap_or(DEFAULT_PIDS)),
-            read_bps: io.read_bps.map(|bps| bps.0),
-            write_bps: io.write_bps.map(|bps| bps.0),
-        },
+        limits: limits(spec, around.unreserved),
         promised: resources.cpu.is_some()
             || resources.memory.is_some()
             || resources.pids.is_some()
@@ -111,6 +112,27 @@ pub(crate) fn launch(id: AttemptId, assignment: &Assignment, around: &Surroundin
         grace_ms: u64::from(spec.grace_period_seconds) * 1_000,
         stop_after_ms: desired(spec, None).stop_after_ms,
         id,
+    }
+}
+
+/// What holds it. A work's are only what it names: they are added to its executor's.
+pub(crate) fn limits(spec: &TaskSpec, unreserved: u64) -> Limits {
+    let resources = &spec.resources;
+    let io = resources.io.clone().unwrap_or_default();
+    let named = Limits {
+        cpu_millis: resources.cpu.map(|cpu| cpu.0),
+        memory_bytes: resources.memory.map(|memory| memory.0),
+        pids: resources.pids,
+        read_bps: io.read_bps.map(|bps| bps.0),
+        write_bps: io.write_bps.map(|bps| bps.0),
+    };
+    if Kind::of(spec) == Kind::Work {
+        return named;
+    }
+    Limits {
+        memory_bytes: named.memory_bytes.or_else(|| Some(unreserved.max(MIN_MEMORY_CAP))),
+        pids: named.pids.or(Some(DEFAULT_PIDS)),
+        ..named
     }
 }
 
@@ -127,6 +149,9 @@ fn environment(
         ("MUSTER_ATTEMPT".to_owned(), id.attempt.to_string()),
         ("MUSTER_RUN_DIR".to_owned(), around.task_dir.join("run").display().to_string()),
     ]);
+    let socket = around.task_dir.join(executor::DIR).join(executor::SOCKET);
+    env.insert(executor::SOCKET_ENV.to_owned(), socket.display().to_string());
+    env.insert(executor::TOKEN_ENV.to_owned(), around.token.to_owned());
     if let Some(lease) = &assignment.lease {
         env.insert("MUSTER_LEASE".to_owned(), lease.clone());
     }
@@ -137,7 +162,18 @@ fn variables(list: &[task::EnvVar]) -> BTreeMap<String, String> {
     list.iter().map(|variable| (variable.name.clone(), variable.value.clone())).collect()
 }
 
-fn program(spec: &TaskSpec) -> (Program, BTreeMap<String, String>) {
+fn program(assignment: &Assignment) -> (Program, BTreeMap<String, String>) {
+    let spec = &assignment.spec;
+    if let (None, Some(run)) = (&spec.run.container, &spec.run.executor) {
+        let work = Work {
+            namespace: assignment.namespace.clone(),
+            name: assignment.name.clone(),
+            executor: run.task.clone(),
+            data: run.data.clone(),
+            lease: assignment.lease.as_deref().and_then(Lease::from_text),
+        };
+        return (Program::Work(work), BTreeMap::new());
+    }
     if let Some(run) = &spec.run.container {
         let program = Program::Container(Container {
             image: run.image.clone(),

@@ -10,8 +10,10 @@ use std::sync::OnceLock;
 use common::agent::Agent;
 use common::controller::Controller;
 use common::cpu::{Accounts, Heavy};
+use common::executor::Executor;
 use common::until;
 use muster_api::wire::agent::v1 as proto;
+use muster_api::wire::executor::v1::TaskState;
 use serde_json::{Value, json};
 
 const IMAGE: &str = "muster-test/busybox:1";
@@ -228,4 +230,36 @@ fn a_container_removed_by_somebody_else_is_lost() {
     let end = controller.wait_end("d-gone");
     assert_eq!(end.phase(), proto::TaskPhase::Failed);
     assert!(matches!(end.reason.as_str(), "ContainerLost" | "Error"), "{end:?}");
+}
+
+#[test]
+fn a_container_is_an_executor_and_its_limits_follow_its_works() {
+    let _cleanup = Cleanup(vec!["d-exec"]);
+    let controller = Controller::start();
+    let agent = start(&controller);
+    let mut spec = sh("[ -S $MUSTER_EXECUTOR_SOCKET ] && echo it is there; exec sleep 1000");
+    spec["resources"] = json!({ "cpu": "100m", "memory": "64Mi" });
+    controller.assign("d-exec", spec);
+    let mut executor = Executor::register(&agent, "d-exec", &[]);
+    controller.wait_running("d-exec");
+    let work = json!({
+        "resources": { "cpu": "200m", "memory": "32Mi" },
+        "run": { "executor": { "task": "task-d-exec", "data": {} } },
+    });
+    controller.assign("d-work", work);
+    assert_eq!(executor.launched().task, "d-work");
+    let id = container("d-exec");
+    let limits = docker(&["inspect", "-f", "{{.HostConfig.NanoCpus}} {{.HostConfig.Memory}}", &id]);
+    assert_eq!(limits, format!("300000000 {}", 96 << 20), "before it is handed over");
+    executor.update("d-work", TaskState::Running);
+    controller.wait_running("d-work");
+    let mut ids = 1..;
+    until("its own look at its socket", || {
+        let id = ids.next()?;
+        let ask = proto::LogRequest { id, uid: "d-exec".to_owned(), ..Default::default() };
+        (controller.logs(ask).0 == "it is there\n").then_some(())
+    });
+    docker(&["kill", &id]);
+    assert_eq!(controller.wait_end("d-work").reason, "ExecutorLost");
+    assert_eq!(controller.wait_end("d-exec").signal, Some(9));
 }

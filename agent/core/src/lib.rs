@@ -9,6 +9,7 @@
 //! | [`workload`] | one task's state machine: `Event` in, `Response` out |
 //! | [`restart`] | when an ended task starts again, and after how long |
 //! | [`report`] | what is told to the controller, and its sequence |
+//! | [`executor`] | an executor and the works it was given: who may end, and on whose word |
 //! | [`plan`] | a set of assignments against the tasks that are known: who gets which event |
 //!
 //! The executor (`muster-agent`'s `driver`) keeps three promises that the proofs here rest on:
@@ -18,6 +19,7 @@
 
 pub mod desired;
 pub mod event;
+pub mod executor;
 pub mod observed;
 pub mod plan;
 pub mod report;

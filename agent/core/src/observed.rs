@@ -20,6 +20,19 @@ pub enum Loss {
     Reboot,
     /// Its container was removed by somebody else.
     Container,
+    /// The executor that ran it ended before it.
+    Executor,
+}
+
+/// What an executor says of a work that is over.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub enum Said {
+    /// It did what it was for.
+    Succeeded,
+    /// It did not.
+    Failed,
+    /// It was ended.
+    Killed,
 }
 
 /// How an attempt ended.
@@ -32,6 +45,15 @@ pub enum End {
     /// The program could not be started; nothing of it ever ran.
     NotStarted {
         /// The kernel's or the engine's words.
+        message: String,
+    },
+    /// Its executor's word for it.
+    Said {
+        /// How it ended.
+        said: Said,
+        /// What its program returned, if it had one.
+        code: Option<i32>,
+        /// The executor's own words.
         message: String,
     },
     /// It is gone, and its status with it.
@@ -60,6 +82,7 @@ impl Exit {
         match self.end {
             End::Exited(code) => Some(code),
             End::Signaled(signal) => Some(128 + signal),
+            End::Said { code, .. } => code,
             End::NotStarted { .. } | End::Lost(_) => None,
         }
     }
@@ -69,14 +92,15 @@ impl Exit {
     pub fn signal(&self) -> Option<i32> {
         match self.end {
             End::Signaled(signal) => Some(signal),
-            End::Exited(_) | End::NotStarted { .. } | End::Lost(_) => None,
+            End::Exited(_) | End::NotStarted { .. } | End::Said { .. } | End::Lost(_) => None,
         }
     }
 
     /// Whether the program says that it did what it was for.
     #[must_use]
     pub fn succeeded(&self) -> bool {
-        self.end == End::Exited(0) && !self.disconnected
+        let well = matches!(self.end, End::Exited(0) | End::Said { said: Said::Succeeded, .. });
+        well && !self.disconnected
     }
 
     /// How long it ran, milliseconds; 0 when it never did or the clock went backwards.

@@ -5,7 +5,7 @@ use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
-use crate::observed::{End, Exit, Loss};
+use crate::observed::{End, Exit, Loss, Said};
 use crate::time::Wall;
 
 /// Where a task is on this node.
@@ -54,6 +54,12 @@ pub enum Reason {
     NodeRebooted,
     /// Its container was removed by somebody else.
     ContainerLost,
+    /// Its executor ended before it.
+    ExecutorLost,
+    /// Its executor ended it.
+    Killed,
+    /// It waits for its executor.
+    AwaitingExecutor,
     /// It waits before it is started again.
     BackOff,
     /// It waits for contact with the controller (`onDisconnect: Stop`).
@@ -77,6 +83,9 @@ impl fmt::Display for Reason {
             Reason::ShimLost => "ShimLost",
             Reason::NodeRebooted => "NodeRebooted",
             Reason::ContainerLost => "ContainerLost",
+            Reason::ExecutorLost => "ExecutorLost",
+            Reason::Killed => "Killed",
+            Reason::AwaitingExecutor => "AwaitingExecutor",
             Reason::BackOff => "BackOff",
             Reason::AwaitingContact => "AwaitingContact",
             Reason::AssignmentUnreadable => "AssignmentUnreadable",
@@ -163,6 +172,17 @@ pub fn explain(exit: &Exit) -> (Reason, String) {
         End::Exited(code) => (Reason::Error, format!("exited with code {code}")),
         End::Signaled(signal) => (Reason::Error, format!("ended by signal {signal}")),
         End::NotStarted { message } => (Reason::StartError, message.clone()),
+        End::Said { said, message, .. } => {
+            let reason = match said {
+                Said::Succeeded => Reason::Completed,
+                Said::Failed => Reason::Error,
+                Said::Killed => Reason::Killed,
+            };
+            (reason, message.clone())
+        }
+        End::Lost(Loss::Executor) => {
+            (Reason::ExecutorLost, "its executor ended before it".to_owned())
+        }
         End::Lost(Loss::Shim) => {
             (Reason::ShimLost, "its shim was killed; what was left of it was ended".to_owned())
         }

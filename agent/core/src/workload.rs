@@ -105,6 +105,8 @@ pub enum Fetch {
     Missing,
     /// Before every attempt.
     Always,
+    /// Nothing, but before every attempt it waits for the executor that is to do it.
+    Executor,
 }
 
 /// One task on this node. All of it is durable.
@@ -119,6 +121,9 @@ pub struct Workload {
     /// It fetches before every attempt, not only when a launch says that something is missing.
     #[serde(default)]
     pub fetch_always: bool,
+    /// An executor does it: the executor can be told to end it while it has not yet begun.
+    #[serde(default)]
+    pub work: bool,
     /// For the present try, it has.
     #[serde(default)]
     pub fetched: bool,
@@ -175,7 +180,8 @@ impl Workload {
             uid,
             desired,
             prepare: fetch != Fetch::Nothing,
-            fetch_always: fetch == Fetch::Always,
+            fetch_always: matches!(fetch, Fetch::Always | Fetch::Executor),
+            work: fetch == Fetch::Executor,
             fetched: false,
             forgotten: false,
             state,
@@ -310,7 +316,7 @@ impl Workload {
             }
             (State::Launching, Outcome::Unprepared(_)) => self.prepare(effects),
             (State::Preparing, Outcome::PrepareFailed(failure))
-            | (State::Launching, Outcome::LaunchFailed(failure)) => {
+            | (State::Launching | State::Stopping { .. }, Outcome::LaunchFailed(failure)) => {
                 self.on_failure(&failure, context, effects);
             }
             (State::Launching, Outcome::Launched(started))
@@ -381,6 +387,10 @@ impl Workload {
 
     fn prepare(&mut self, effects: &mut Vec<Effect>) {
         self.state = State::Preparing;
+        if self.work {
+            let message = "waits until its executor has registered".to_owned();
+            self.say(Reason::AwaitingExecutor, message);
+        }
         effects.push(Effect::Prepare(self.attempt));
     }
 
@@ -411,10 +421,11 @@ impl Workload {
         // What a runtime wrote just before a power cut may be gone: after a boot, a launch that was
         // under way counts as one that happened.
         if began || rebooted {
-            let end = End::Lost(match (rebooted, self.prepare) {
-                (true, _) => Loss::Reboot,
-                (false, true) => Loss::Container,
-                (false, false) => Loss::Shim,
+            let end = End::Lost(match (rebooted, self.work, self.prepare) {
+                (true, ..) => Loss::Reboot,
+                (false, true, _) => Loss::Executor,
+                (false, false, true) => Loss::Container,
+                (false, false, false) => Loss::Shim,
             });
             let started_at = self.report.content.started_at;
             let exit = Exit {
@@ -469,7 +480,7 @@ impl Workload {
         content.finished_at = Some(exit.finished_at);
         (content.reason, content.message) = explain(exit);
         if let Some(order) = &self.desired.stop
-            && matches!(content.reason, Reason::Error | Reason::StartError)
+            && matches!(content.reason, Reason::Error | Reason::StartError | Reason::Killed)
         {
             content.reason = Reason::Stopped;
             content.message.clone_from(&order.reason);
@@ -518,6 +529,11 @@ impl Workload {
             State::Preparing => {
                 effects.push(Effect::CancelPrepare);
                 self.ended_unstarted(context, effects);
+            }
+            // Nobody may ever answer for it: an executor is free to take its time.
+            State::Launching if self.work => {
+                self.stop(context, effects);
+                effects.push(Effect::Watch(self.attempt));
             }
             State::Running { .. } | State::Stopping { .. } => self.stop(context, effects),
             State::Ended if self.forgotten => self.remove(context, effects),

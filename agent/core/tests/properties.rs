@@ -5,7 +5,7 @@
 use std::collections::BTreeMap;
 
 use muster_agent_core::desired::{Desired, RestartPolicy, StopOrder};
-use muster_agent_core::observed::{End, Exit, Observed, Started};
+use muster_agent_core::observed::{End, Exit, Loss, Observed, Started};
 use muster_agent_core::report::Report;
 use muster_agent_core::time::{Boot, Now, Wall};
 use muster_agent_core::workload::{
@@ -59,7 +59,12 @@ fn action() -> impl Strategy<Value = Action> {
 }
 
 fn fetch() -> impl Strategy<Value = Fetch> {
-    prop_oneof![Just(Fetch::Nothing), Just(Fetch::Missing), Just(Fetch::Always)]
+    prop_oneof![
+        Just(Fetch::Nothing),
+        Just(Fetch::Missing),
+        Just(Fetch::Always),
+        Just(Fetch::Executor)
+    ]
 }
 
 fn policy() -> impl Strategy<Value = RestartPolicy> {
@@ -152,6 +157,11 @@ impl World {
                 Effect::Stop { attempt, .. } => {
                     // The ladder does not depend on the agent: it ends the attempt some time.
                     self.stopping |= self.attempts.get(&attempt) == Some(&Attempt::Live);
+                    if self.fetch == Fetch::Executor && !self.attempts.contains_key(&attempt) {
+                        // A work that its executor has not got yet ends where it is.
+                        let killed = Attempt::Ended(self.exit(End::Lost(Loss::Executor)));
+                        self.attempts.insert(attempt, killed);
+                    }
                 }
                 Effect::CancelPrepare => {
                     self.under_way.retain(|effect| !matches!(effect, Effect::Prepare(_)));
@@ -233,8 +243,13 @@ impl World {
                 if fail {
                     return self.answer(attempt, Outcome::LaunchFailed(failure));
                 }
+                if let Some(Attempt::Ended(exit)) = self.attempts.get(&attempt).cloned() {
+                    return self.answer(attempt, Outcome::Exited(exit));
+                }
                 if self.missing {
-                    return self.answer(attempt, Outcome::Unprepared(failure));
+                    let away = self.fetch == Fetch::Executor;
+                    let outcome = if away { Outcome::LaunchFailed } else { Outcome::Unprepared };
+                    return self.answer(attempt, outcome(failure));
                 }
                 self.begin(attempt);
                 self.answer(attempt, Outcome::Launched(Started { at: Wall(0) }));
@@ -263,6 +278,9 @@ impl World {
             return;
         }
         if let Some(Effect::Launch(attempt)) = self.under_way.get(index).cloned() {
+            if self.attempts.contains_key(&attempt) {
+                return;
+            }
             self.under_way.remove(index);
             self.begin(attempt);
             self.answer(attempt, Outcome::LaunchUnclear);
@@ -313,6 +331,7 @@ impl World {
                     Effect::Launch(attempt) => Some(*attempt),
                     _ => None,
                 });
+                let launch = launch.filter(|attempt| !self.attempts.contains_key(attempt));
                 if let Some(attempt) = launch.filter(|_| !self.missing) {
                     self.begin(attempt);
                     self.crash();

@@ -29,6 +29,7 @@ use super::stream_logs::stream_logs;
 use super::{Address, report, tls};
 use crate::clock;
 use crate::driver::{Shared, chain};
+use crate::executor::frame::FRAME_MAX;
 use crate::node::Node;
 
 /// The client's side of the service.
@@ -135,7 +136,9 @@ impl Link {
     }
 
     async fn session(&self, node: &mut Node) -> Result<(), SessionError> {
-        let mut client = AgentServiceClient::new(self.channel().await?);
+        let mut client = AgentServiceClient::new(self.channel().await?)
+            .max_decoding_message_size(FRAME_MAX)
+            .max_encoding_message_size(FRAME_MAX);
         let (out, queue) = mpsc::channel(QUEUE);
         let sent = clock::boot();
         let reports = self.shared.board.reports();
@@ -204,8 +207,8 @@ impl Session<'_> {
         let mut last_heard = Instant::now();
         loop {
             // Every arm is cancel-safe: a stream's next message stays in the stream, a permit that
-            // was stored stays stored, a tick and a join are taken whole or not at all. What an arm
-            // sends, it sends before the next wait.
+            // was stored stays stored, a message stays queued, a tick and a join are taken whole or
+            // not at all. What an arm sends, it sends before the next wait.
             tokio::select! {
                 message = heard.message() => {
                     last_heard = Instant::now();
@@ -214,6 +217,10 @@ impl Session<'_> {
                         Some(_) => tracing::warn!("the controller says something newer than this agent"),
                         None => return Err(SessionError::Closed),
                     }
+                }
+                message = shared.desks.said() => {
+                    // At most once: with the session goes what was under way.
+                    self.say(Say::Message(message)).await?;
                 }
                 () = shared.board.changed() => self.say_reports().await?,
                 _ = beats.tick() => {
@@ -234,12 +241,6 @@ impl Session<'_> {
 
     async fn hear(&mut self, body: Hear) {
         match body {
-            Hear::Message(message) => {
-                tracing::warn!(
-                    executor = message.executor,
-                    "a message for no executor of this node is dropped"
-                );
-            }
             Hear::Welcome(_) => tracing::warn!("a second welcome"),
             Hear::Assignments(assignments) => {
                 // Closed: the agent is going down, and this session with it.
@@ -255,6 +256,7 @@ impl Session<'_> {
                 self.link.shared.board.acknowledged(&answer.uid, answer.sequence);
             }
             Hear::Log(request) => self.start_reader(request).await,
+            Hear::Message(message) => self.link.shared.desks.deliver(message),
             Hear::LogCancel(cancel) => {
                 if let Some(reader) = self.requests.remove(&cancel.id) {
                     reader.abort();

@@ -12,7 +12,9 @@ use muster_agent_core::workload::Failure;
 use muster_api::id::TaskUid;
 use tokio::sync::Notify;
 
-use super::{AttemptId, Launch, Launched, LogQuery, Runtime, RuntimeError, RuntimeStatus, Used};
+use super::{
+    AttemptId, Launch, Launched, Limits, LogQuery, Runtime, RuntimeError, RuntimeStatus, Used,
+};
 
 /// The fake. An answer that was not given never comes.
 #[derive(Debug, Default)]
@@ -90,6 +92,15 @@ impl Runtime for Fake {
         _: Duration,
     ) -> BoxFuture<'a, Result<(), RuntimeError>> {
         self.ask("stop", id);
+        async { Ok(()) }.boxed()
+    }
+
+    fn resize<'a>(
+        &'a self,
+        id: &'a AttemptId,
+        _: &'a Limits,
+    ) -> BoxFuture<'a, Result<(), RuntimeError>> {
+        self.ask("resize", id);
         async { Ok(()) }.boxed()
     }
 

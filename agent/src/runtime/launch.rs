@@ -50,6 +50,39 @@ pub(crate) enum Program {
     },
     /// A container.
     Container(Container),
+    /// What an executor on this node does.
+    Work(Work),
+}
+
+/// What an executor is told.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "camelCase")]
+pub(crate) struct Work {
+    pub(crate) namespace: String,
+    pub(crate) name: String,
+    /// Name of the executor's task, in the same namespace.
+    pub(crate) executor: String,
+    pub(crate) data: serde_json::Map<String, serde_json::Value>,
+    pub(crate) lease: Option<Lease>,
+}
+
+/// The right to the actuators of a group.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "camelCase")]
+pub(crate) struct Lease {
+    pub(crate) node: String,
+    pub(crate) group: String,
+    pub(crate) epoch: u64,
+}
+
+impl Lease {
+    /// From `<node>.<group>:<epoch>[,sequence…]`.
+    pub(crate) fn from_text(text: &str) -> Option<Lease> {
+        let (whose, number) = text.rsplit_once(':')?;
+        let (node, group) = whose.rsplit_once('.')?;
+        let epoch = number.split(',').next()?.parse().ok()?;
+        Some(Lease { node: node.to_owned(), group: group.to_owned(), epoch })
+    }
 }
 
 /// A container of an engine.

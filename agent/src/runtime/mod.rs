@@ -90,6 +90,12 @@ pub(crate) trait Runtime: Send + Sync + std::fmt::Debug {
         id: &'a AttemptId,
         grace: Duration,
     ) -> BoxFuture<'a, Result<(), RuntimeError>>;
+    /// Holds a running attempt to other limits from now on; each one is read back.
+    fn resize<'a>(
+        &'a self,
+        id: &'a AttemptId,
+        limits: &'a Limits,
+    ) -> BoxFuture<'a, Result<(), RuntimeError>>;
     /// Removes every trace of a task of which nothing runs.
     fn remove<'a>(&'a self, uid: &'a TaskUid) -> BoxFuture<'a, Result<(), RuntimeError>>;
     /// What the kernel counted for a running attempt.

@@ -51,6 +51,7 @@ struct Seen {
     usage: BTreeMap<String, proto::Usage>,
     beats: u64,
     logs: BTreeMap<u64, (Vec<u8>, Option<String>)>,
+    messages: Vec<proto::Message>,
     session: Option<mpsc::UnboundedSender<Result<proto::ControllerMessage, Status>>>,
     /// What every session begins with.
     assignments: BTreeMap<String, proto::Assignment>,
@@ -235,6 +236,17 @@ impl Controller {
         self.say(Say::Log(request));
     }
 
+    /// Says something to an executor, as its framework would.
+    pub fn message(&self, executor: &str, data: Vec<u8>) {
+        let executor = executor.to_owned();
+        self.say(Say::Message(proto::Message { executor, data: data.into() }));
+    }
+
+    /// What executors said to frameworks.
+    pub fn messages(&self) -> Vec<proto::Message> {
+        self.seen(|seen| seen.messages.clone())
+    }
+
     pub fn cancel_logs(&self, id: u64) {
         self.say(Say::LogCancel(proto::LogCancel { id }));
     }
@@ -293,7 +305,11 @@ fn server_tls(ca: &Ca) -> rustls::ServerConfig {
 
 async fn serve(listener: TcpListener, ca: Arc<Ca>, seen: Arc<Mutex<Seen>>) {
     let acceptor = tokio_rustls::TlsAcceptor::from(Arc::new(server_tls(&ca)));
-    let routes = tonic::service::Routes::new(AgentServiceServer::new(Service(Arc::clone(&seen))));
+    let routes = tonic::service::Routes::new(
+        AgentServiceServer::new(Service(Arc::clone(&seen)))
+            .max_decoding_message_size(5 << 20)
+            .max_encoding_message_size(5 << 20),
+    );
     loop {
         let (tcp, _) = listener.accept().await.unwrap();
         let (acceptor, routes) = (acceptor.clone(), routes.clone().prepare());
@@ -432,7 +448,10 @@ fn take(seen: &mut Seen, heard: Heard) {
             seen.reports.entry(report.uid.clone()).or_default().push(report);
             Some(Say::Task(ack))
         }
-        Heard::Message(_) => None,
+        Heard::Message(message) => {
+            seen.messages.push(message);
+            None
+        }
         Heard::Log(chunk) => {
             let (text, end) = seen.logs.entry(chunk.id).or_default();
             text.extend_from_slice(&chunk.data);

@@ -12,6 +12,7 @@
 pub mod agent;
 pub mod controller;
 pub mod cpu;
+pub mod executor;
 
 use std::time::{Duration, Instant};
 

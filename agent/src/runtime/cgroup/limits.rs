@@ -83,6 +83,53 @@ pub(super) fn apply(group: &Group, limits: &Limits, disk: &Path) -> Result<(), L
     Ok(())
 }
 
+/// Writes other limits into a group in use. I/O rates stay. Memory that is in use and cannot be
+/// reclaimed stays allowed: nothing is killed for a limit that shrinks.
+pub(super) fn resize(group: &Group, limits: &Limits) -> Result<(), LimitError> {
+    let v2 = group.version() == Version::V2;
+    cpu(group, limits.cpu_millis, v2)?;
+    if limits.cpu_millis.is_none() {
+        lift_cpu(group, v2)?;
+    }
+    if let Some(count) = limits.pids {
+        pids(group, count, v2)?;
+    }
+    let Some(bytes) = limits.memory_bytes else { return Ok(()) };
+    let dir = dir(group, Controller::Memory)?;
+    let file = |name: &str| dir.join(name);
+    if v2 {
+        let what = "the memory limit";
+        let used = stat(&file("memory.stat"), "anon")?;
+        if used > bytes {
+            let (wanted, shown) = (bytes.to_string(), format!("{used} in use"));
+            return Err(LimitError::NotTaken { what, wanted, shown });
+        }
+        return memory(group, bytes, v2);
+    }
+    // Memory and swap together may never be below memory: a limit that grows, grows there first.
+    let both = file("memory.memsw.limit_in_bytes");
+    if both.exists() && read_number(&both)? < bytes {
+        let write = std::fs::write(&both, bytes.to_string());
+        write.map_err(|source| LimitError::File { file: both, source })?;
+    }
+    memory(group, bytes, v2)
+}
+
+fn lift_cpu(group: &Group, v2: bool) -> Result<(), LimitError> {
+    let (name, text) = if v2 { ("cpu.max", "max") } else { ("cpu.cfs_quota_us", "-1") };
+    let file = dir(group, Controller::Cpu)?.join(name);
+    std::fs::write(&file, text).map_err(|source| LimitError::File { file, source })
+}
+
+/// A line of a `key value` file; 0 when it has none.
+fn stat(file: &Path, key: &str) -> Result<u64, LimitError> {
+    let text = std::fs::read_to_string(file)
+        .map_err(|source| LimitError::File { file: file.to_owned(), source })?;
+    let value =
+        text.lines().find_map(|line| line.strip_prefix(key)?.strip_prefix(' ')?.parse().ok());
+    Ok(value.unwrap_or(0))
+}
+
 /// Quota and period for a share of a core, microseconds.
 pub(crate) fn bandwidth(cpu_millis: u64) -> (u64, u64) {
     let quota = cpu_millis * PERIOD_US / 1_000;

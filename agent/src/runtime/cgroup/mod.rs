@@ -48,6 +48,11 @@ pub(crate) enum Controller {
     Freezer,
 }
 
+/// Holds a group that is in use to other limits.
+pub(crate) fn resize(group: &Group, limits: &Limits) -> Result<(), LimitError> {
+    limits::resize(group, limits)
+}
+
 /// What the agent needs of a kernel that enforces quotas. [`Kernel`] is the real one.
 pub(crate) trait Enforcer: Send + Sync + std::fmt::Debug {
     /// Makes a group of that name, empty and limited. Every limit was read back from the kernel.

@@ -3,13 +3,15 @@
 use std::collections::HashMap;
 
 use bollard::models::{
-    ContainerCreateBody, HostConfig, HostConfigLogConfig, Mount, MountType, ThrottleDevice,
+    ContainerCreateBody, ContainerUpdateBody, HostConfig, HostConfigLogConfig, Mount, MountType,
+    ThrottleDevice,
 };
 use muster_agent_core::workload::Failure;
 
 use super::DockerConfig;
+use crate::executor;
 use crate::runtime::cgroup::device;
-use crate::runtime::launch::{Container, Launch, Network, Program};
+use crate::runtime::launch::{Container, Launch, Limits, Network, Program};
 
 /// Whose container it is.
 pub(super) const LABEL_AGENT: &str = "muster.dev/agent";
@@ -20,6 +22,9 @@ pub(super) const LABEL_ATTEMPT: &str = "muster.dev/attempt";
 
 /// Where a container sees its task's run directory.
 const RUN_DIR: &str = "/run/muster";
+
+/// Where a container sees the directory of its executor socket.
+const EXECUTOR_DIR: &str = "/run/muster-executor";
 
 /// The least cpu weight that the engine gives: that of a task which reserved none.
 const MIN_SHARES: i64 = 2;
@@ -40,6 +45,8 @@ pub(super) fn body(launch: &Launch, config: &DockerConfig) -> Result<ContainerCr
     })?;
     let mut env = launch.env.clone();
     env.insert("MUSTER_RUN_DIR".to_owned(), RUN_DIR.to_owned());
+    let socket = format!("{EXECUTOR_DIR}/{}", executor::SOCKET);
+    env.insert(executor::SOCKET_ENV.to_owned(), socket);
     let list = |words: &[String]| if words.is_empty() { None } else { Some(words.to_vec()) };
     Ok(ContainerCreateBody {
         image: Some(container.image.clone()),
@@ -68,9 +75,13 @@ fn host(
     run_dir: &str,
 ) -> Result<HostConfig, Failure> {
     let limits = &launch.limits;
-    let signed = |value: u64| i64::try_from(value).unwrap_or(i64::MAX);
-    let memory = limits.memory_bytes.map(|bytes| signed(bytes.max(MIN_MEMORY)));
+    let sizes = update(limits);
     let mut mounts = vec![mount(run_dir, RUN_DIR, false)];
+    // The directory, not the socket: another life of the agent makes that anew.
+    let seat = config.tasks.join(launch.id.uid.as_str()).join(executor::DIR);
+    if seat.exists() {
+        mounts.push(mount(&seat.display().to_string(), EXECUTOR_DIR, true));
+    }
     mounts.extend(container.mounts.iter().map(|m| mount(&m.host, &m.container, m.read_only)));
     let throttle = |bps: Option<u64>| -> Result<Option<Vec<ThrottleDevice>>, Failure> {
         let Some(bps) = bps else { return Ok(None) };
@@ -78,14 +89,11 @@ fn host(
         Ok(Some(vec![ThrottleDevice { path: Some(path), rate: Some(signed(bps)) }]))
     };
     Ok(HostConfig {
-        nano_cpus: limits.cpu_millis.map(|millis| signed(millis.saturating_mul(1_000_000))),
-        cpu_shares: Some(limits.cpu_millis.map_or(MIN_SHARES, |millis| {
-            signed(millis.saturating_mul(1_024) / 1_000).max(MIN_SHARES)
-        })),
-        memory,
-        // Memory and swap together: no swap.
-        memory_swap: memory,
-        pids_limit: limits.pids.map(signed),
+        nano_cpus: sizes.nano_cpus,
+        cpu_shares: sizes.cpu_shares,
+        memory: sizes.memory,
+        memory_swap: sizes.memory_swap,
+        pids_limit: sizes.pids_limit,
         blkio_device_read_bps: throttle(limits.read_bps)?,
         blkio_device_write_bps: throttle(limits.write_bps)?,
         network_mode: Some(
@@ -108,6 +116,26 @@ fn host(
         auto_remove: Some(false),
         ..HostConfig::default()
     })
+}
+
+fn signed(value: u64) -> i64 {
+    i64::try_from(value).unwrap_or(i64::MAX)
+}
+
+/// The limits that a container can be given while it runs.
+pub(super) fn update(limits: &Limits) -> ContainerUpdateBody {
+    let memory = limits.memory_bytes.map(|bytes| signed(bytes.max(MIN_MEMORY)));
+    ContainerUpdateBody {
+        nano_cpus: limits.cpu_millis.map(|millis| signed(millis.saturating_mul(1_000_000))),
+        cpu_shares: Some(limits.cpu_millis.map_or(MIN_SHARES, |millis| {
+            signed(millis.saturating_mul(1_024) / 1_000).max(MIN_SHARES)
+        })),
+        memory,
+        // Memory and swap together: no swap.
+        memory_swap: memory,
+        pids_limit: limits.pids.map(signed),
+        ..ContainerUpdateBody::default()
+    }
 }
 
 fn mount(source: &str, target: &str, read_only: bool) -> Mount {

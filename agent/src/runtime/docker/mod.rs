@@ -37,7 +37,9 @@ use tokio::sync::Notify;
 
 use super::cgroup::group::Group;
 use super::process::{KEPT_ATTEMPTS, Reexec};
-use super::{AttemptId, Launch, Launched, LogQuery, Runtime, RuntimeError, RuntimeStatus, Used};
+use super::{
+    AttemptId, Launch, Launched, Limits, LogQuery, Runtime, RuntimeError, RuntimeStatus, Used,
+};
 use crate::clock;
 use crate::driver::chain;
 use crate::runtime::launch::{Container, Program, Pull};
@@ -401,7 +403,7 @@ impl Runtime for DockerRuntime {
     fn prepare<'a>(&'a self, launch: &'a Launch) -> BoxFuture<'a, Result<(), Failure>> {
         match &launch.program {
             Program::Container(container) => self.prepare(container).boxed(),
-            Program::Process { .. } => futures::future::ready(Ok(())).boxed(),
+            Program::Process { .. } | Program::Work(_) => futures::future::ready(Ok(())).boxed(),
         }
     }
 
@@ -423,6 +425,19 @@ impl Runtime for DockerRuntime {
         grace: Duration,
     ) -> BoxFuture<'a, Result<(), RuntimeError>> {
         self.stop(id, grace).boxed()
+    }
+
+    fn resize<'a>(
+        &'a self,
+        id: &'a AttemptId,
+        limits: &'a Limits,
+    ) -> BoxFuture<'a, Result<(), RuntimeError>> {
+        async move {
+            let (docker, name) = (self.client()?, self.name(id));
+            let update = docker.update_container(&name, create::update(limits));
+            update.await.map_err(|error| RuntimeError::new("change a container's limits", error))
+        }
+        .boxed()
     }
 
     fn remove<'a>(&'a self, uid: &'a TaskUid) -> BoxFuture<'a, Result<(), RuntimeError>> {

@@ -43,7 +43,7 @@ use tokio::io::AsyncReadExt;
 use tokio::io::unix::AsyncFd;
 
 use super::cgroup::{Enforcer, Kernel};
-use super::launch::{AttemptId, Launch, Used};
+use super::launch::{AttemptId, Launch, Limits, Used};
 use super::{Launched, LogQuery, Runtime, RuntimeError, RuntimeStatus, logs};
 use crate::clock;
 use crate::durable::FileError;
@@ -384,6 +384,28 @@ impl Runtime for ProcessRuntime {
         grace: Duration,
     ) -> BoxFuture<'a, Result<(), RuntimeError>> {
         async move { self.stop(id, grace) }.boxed()
+    }
+
+    fn resize<'a>(
+        &'a self,
+        id: &'a AttemptId,
+        limits: &'a Limits,
+    ) -> BoxFuture<'a, Result<(), RuntimeError>> {
+        async move {
+            let what = "change the limits of a process";
+            // Without a group nothing is enforced, and the node says so.
+            let Some(Live { reach: Reach::Group(group), .. }) = self.live(id) else {
+                return Ok(());
+            };
+            let limits = *limits;
+            let done =
+                tokio::task::spawn_blocking(move || super::cgroup::resize(&group, &limits)).await;
+            match done {
+                Ok(done) => done.map_err(|error| RuntimeError::new(what, error)),
+                Err(error) => Err(RuntimeError::new(what, error)),
+            }
+        }
+        .boxed()
     }
 
     fn remove<'a>(&'a self, uid: &'a TaskUid) -> BoxFuture<'a, Result<(), RuntimeError>> {

@@ -1,0 +1,103 @@
+//! The executor's side of the socket. Its processes are the task's; its words are the test's.
+
+use std::io::{Read, Write};
+use std::os::unix::net::UnixStream;
+
+use muster_api::wire::executor::v1 as proto;
+use prost::Message;
+use proto::call::Call as Say;
+use proto::event::Event as Heard;
+
+use super::agent::Agent;
+use super::until;
+
+/// A connection of an executor that has registered.
+pub struct Executor {
+    stream: UnixStream,
+    sequence: u64,
+}
+
+impl Executor {
+    /// Connects to the socket of the task `uid`, once it listens.
+    #[track_caller]
+    pub fn dial(agent: &Agent, uid: &str) -> Executor {
+        let socket = agent.task_dir(uid).join("executor/socket");
+        let stream = until("an executor's socket", || UnixStream::connect(&socket).ok());
+        stream.set_read_timeout(Some(super::PATIENCE)).unwrap();
+        Executor { stream, sequence: 0 }
+    }
+
+    pub fn show(&mut self, token: &str, works: &[&str]) {
+        self.say(Say::Register(proto::Register {
+            token: token.to_owned(),
+            tasks: works.iter().map(|work| (*work).to_owned()).collect(),
+            unacknowledged: Vec::new(),
+        }));
+    }
+
+    /// Connects as the executor of the task `uid`.
+    #[track_caller]
+    pub fn register(agent: &Agent, uid: &str, works: &[&str]) -> Executor {
+        let mut executor = Executor::dial(agent, uid);
+        // The socket is there before the first record is.
+        let path = agent.task_dir(uid).join("task.json");
+        let record = until("the task's record", || std::fs::read(&path).ok());
+        let record: serde_json::Value = serde_json::from_slice(&record).unwrap();
+        executor.show(record["token"].as_str().unwrap(), works);
+        let Heard::Registered(greeting) = executor.hear() else { panic!("no greeting") };
+        assert_eq!((greeting.executor.as_str(), greeting.node.as_str()), (uid, "robot-1"));
+        executor
+    }
+
+    /// Goes on with the sequence of an earlier connection.
+    pub fn after(mut self, before: &Executor) -> Executor {
+        self.sequence = before.sequence;
+        self
+    }
+
+    pub fn say(&mut self, call: Say) {
+        let bytes = proto::Call { call: Some(call) }.encode_to_vec();
+        self.stream.write_all(&u32::try_from(bytes.len()).unwrap().to_be_bytes()).unwrap();
+        self.stream.write_all(&bytes).unwrap();
+    }
+
+    #[track_caller]
+    pub fn hear(&mut self) -> Heard {
+        let mut length = [0; 4];
+        self.stream.read_exact(&mut length).unwrap();
+        let mut bytes = vec![0; usize::try_from(u32::from_be_bytes(length)).unwrap()];
+        self.stream.read_exact(&mut bytes).unwrap();
+        proto::Event::decode(bytes.as_slice()).unwrap().event.unwrap()
+    }
+
+    #[track_caller]
+    pub fn launched(&mut self) -> proto::Launch {
+        match self.hear() {
+            Heard::Launch(launch) => launch,
+            other => panic!("no launch: {other:?}"),
+        }
+    }
+
+    /// Says it, and waits until the agent has it on its disk.
+    #[track_caller]
+    pub fn update(&mut self, work: &str, state: proto::TaskState) {
+        self.sequence += 1;
+        self.say(Say::StatusUpdate(proto::StatusUpdate {
+            task: work.to_owned(),
+            sequence: self.sequence,
+            state: state.into(),
+            message: format!("{work} says so"),
+            exit_code: (state == proto::TaskState::Failed).then_some(7),
+        }));
+        let Heard::Acknowledged(ack) = self.hear() else { panic!("no acknowledgement") };
+        assert_eq!(ack.sequence, self.sequence);
+    }
+
+    /// Whether the agent has closed the connection.
+    pub fn is_closed(&mut self) -> bool {
+        match self.stream.read(&mut [0]) {
+            Ok(read) => read == 0,
+            Err(error) => error.kind() == std::io::ErrorKind::ConnectionReset,
+        }
+    }
+}

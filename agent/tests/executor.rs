@@ -1,0 +1,206 @@
+//! Executors under a real agent: real processes and control groups; what the executor says, the test says.
+
+#![expect(clippy::unwrap_used, reason = "tests")]
+
+mod common;
+
+use common::agent::Agent;
+use common::controller::Controller;
+use common::executor::Executor;
+use common::{lives, until};
+use muster_api::wire::agent::v1::{self as agent_proto, TaskPhase};
+use muster_api::wire::executor::v1 as proto;
+use proto::TaskState;
+use proto::call::Call as Say;
+use proto::event::Event as Heard;
+use serde_json::json;
+
+fn assign(controller: &Controller, uid: &str, spec: &serde_json::Value) {
+    controller.assign_with(agent_proto::Assignment {
+        uid: uid.to_owned(),
+        namespace: "lab".to_owned(),
+        name: uid.to_owned(),
+        spec: serde_json::to_vec(spec).unwrap(),
+        lease: Some(agent_proto::LeaseToken {
+            node: "robot-1".to_owned(),
+            group: "body".to_owned(),
+            epoch: 3,
+            sequence: vec![],
+        }),
+        ..Default::default()
+    });
+}
+
+fn assign_executor(controller: &Controller) {
+    assign(
+        controller,
+        "exec",
+        &json!({
+            "resources": { "cpu": "100m", "memory": "64Mi" },
+            "run": { "process": { "command": ["sleep", "1000"] } },
+        }),
+    );
+}
+
+fn assign_work(controller: &Controller, uid: &str) {
+    assign(
+        controller,
+        uid,
+        &json!({
+            "resources": { "cpu": "200m", "memory": "32Mi" },
+            "run": { "executor": { "task": "exec", "data": { "goal": [1, "x"] } } },
+        }),
+    );
+}
+
+/// An executor with two works that run.
+fn two_works(controller: &Controller, agent: &Agent) -> Executor {
+    assign_work(controller, "w1");
+    controller.wait("w1", "waiting", |report| report.reason == "AwaitingExecutor");
+    assign_executor(controller);
+    let mut executor = Executor::register(agent, "exec", &[]);
+    let launch = executor.launched();
+    assert_eq!((launch.task.as_str(), launch.name.as_str()), ("w1", "w1"));
+    assert!(launch.data.unwrap().fields.contains_key("goal"));
+    let lease = launch.lease.unwrap();
+    assert_eq!((lease.node.as_str(), lease.group.as_str(), lease.epoch), ("robot-1", "body", 3));
+    assign_work(controller, "w2");
+    assert_eq!(executor.launched().task, "w2");
+    for work in ["w1", "w2"] {
+        executor.update(work, TaskState::Starting);
+        executor.update(work, TaskState::Running);
+        controller.wait_running(work);
+    }
+    executor
+}
+
+/// Cpu in thousandths of a core and memory in bytes, from the kernel.
+fn limits(agent: &Agent) -> (i64, u64) {
+    let read = |controller: &str, file: &str| {
+        std::fs::read_to_string(agent.group("exec", 1, controller).join(file)).ok()
+    };
+    if let Some(max) = read("cpu", "cpu.max") {
+        let numbers: Vec<i64> = max.split_whitespace().map(|n| n.parse().unwrap()).collect();
+        let memory = read("memory", "memory.max").unwrap().trim().parse().unwrap();
+        return (numbers[0] * 1_000 / numbers[1], memory);
+    }
+    let number = |controller: &str, file: &str| -> i64 {
+        read(controller, file).unwrap().trim().parse().unwrap()
+    };
+    let quota = number("cpu", "cpu.cfs_quota_us") * 1_000 / number("cpu", "cpu.cfs_period_us");
+    (quota, number("memory", "memory.limit_in_bytes").cast_unsigned())
+}
+
+#[test]
+fn works_run_end_and_are_ended_and_the_limits_follow() {
+    let controller = Controller::start();
+    let agent = Agent::start(&controller);
+    let mut executor = two_works(&controller, &agent);
+    assert_eq!(limits(&agent), (500, 128 << 20));
+
+    let large = vec![7; 4 << 20];
+    controller.message("exec", large.clone());
+    let Heard::Message(message) = executor.hear() else { panic!("no message") };
+    assert!(message.data == large);
+    for data in [message.data, b"second".to_vec().into()] {
+        executor.say(Say::Message(proto::Message { data }));
+    }
+    let heard = until("both", || Some(controller.messages()).filter(|all| all.len() == 2));
+    assert!(heard[0].data == large && heard[1].data == "second" && heard[1].executor == "exec");
+
+    executor.update("w1", TaskState::Failed);
+    let end = controller.wait_end("w1");
+    assert_eq!((end.exit_code, end.message.as_str()), (Some(7), "w1 says so"), "{end:?}");
+    until("less room", || (limits(&agent) == (300, 96 << 20)).then_some(()));
+
+    controller.stop("w2", 30_000);
+    let Heard::Kill(kill) = executor.hear() else { panic!("no kill") };
+    assert_eq!((kill.task.as_str(), kill.grace_period_ms), ("w2", 30_000));
+    executor.update("w2", TaskState::Killed);
+    let end = controller.wait_end("w2");
+    assert_eq!((end.phase(), end.reason.as_str()), (TaskPhase::Failed, "Stopped"), "{end:?}");
+    until("its own room", || (limits(&agent) == (100, 64 << 20)).then_some(()));
+    assert!(lives(agent.main_pid("exec", 1)));
+}
+
+#[test]
+fn works_outlive_the_agent_and_end_with_their_executor() {
+    let controller = Controller::start();
+    let mut agent = Agent::start(&controller);
+    let before = two_works(&controller, &agent);
+    let pid = agent.main_pid("exec", 1);
+    agent.kill();
+    agent.spawn();
+    controller.wait_hello(2);
+    let mut executor = Executor::register(&agent, "exec", &["w1", "w2"]).after(&before);
+    assign_work(&controller, "w3");
+    assert_eq!(executor.launched().task, "w3", "no work is handed over twice");
+    executor.update("w3", TaskState::Succeeded);
+    assert_eq!(controller.wait_end("w3").phase(), TaskPhase::Succeeded);
+    assert!(lives(pid) && agent.main_pid("exec", 1) == pid);
+
+    // SAFETY: a signal to a process of this test.
+    unsafe { libc::kill(pid, libc::SIGKILL) };
+    for work in ["w1", "w2"] {
+        let end = controller.wait_end(work);
+        assert_eq!((end.phase(), end.reason.as_str()), (TaskPhase::Failed, "ExecutorLost"));
+        assert!(!lives(pid), "{work} ended before its executor");
+    }
+    assert!(executor.is_closed());
+    assign_work(&controller, "late");
+    assert_eq!(controller.wait_end("late").reason, "ExecutorLost");
+}
+
+#[test]
+fn who_does_not_end_its_work_is_ended() {
+    let controller = Controller::start();
+    let agent = Agent::start(&controller);
+    let mut executor = two_works(&controller, &agent);
+    let pid = agent.main_pid("exec", 1);
+    controller.stop("w1", 200);
+    assert!(matches!(executor.hear(), Heard::Kill(_)));
+    for work in ["w1", "w2"] {
+        assert_eq!(controller.wait_end(work).reason, "ExecutorLost");
+        assert!(!lives(pid), "{work} ended before its executor");
+    }
+    assert!(controller.wait_end("exec").signal.is_some());
+}
+
+#[test]
+fn only_who_has_the_token_is_the_executor() {
+    let controller = Controller::start();
+    let agent = Agent::start(&controller);
+    let mut executor = two_works(&controller, &agent);
+    let mut stranger = Executor::dial(&agent, "exec");
+    stranger.show(&"0".repeat(32), &[]);
+    assert!(stranger.is_closed());
+    let mut hasty = Executor::dial(&agent, "exec");
+    hasty.say(Say::Message(proto::Message { data: "first".into() }));
+    assert!(hasty.is_closed());
+    // Neither disturbed it; who has the token takes its place.
+    executor.update("w1", TaskState::Running);
+    let mut next = Executor::register(&agent, "exec", &["w1", "w2"]).after(&executor);
+    assert!(executor.is_closed());
+    next.update("w1", TaskState::Succeeded);
+    assert_eq!(controller.wait_end("w1").phase(), TaskPhase::Succeeded);
+    assert!(controller.messages().is_empty());
+}
+
+#[test]
+fn a_work_of_which_nothing_was_said_ends_without_contact_too() {
+    let controller = Controller::start();
+    let agent = Agent::start(&controller);
+    assign_executor(&controller);
+    let mut executor = Executor::register(&agent, "exec", &[]);
+    let spec = json!({
+        "run": { "executor": { "task": "exec", "data": {} } },
+        "onDisconnect": { "policy": "Stop", "after": "1s" },
+    });
+    assign(&controller, "tied", &spec);
+    assert_eq!(executor.launched().task, "tied");
+    controller.set_away(true);
+    assert!(matches!(executor.hear(), Heard::Kill(kill) if kill.task == "tied"));
+    executor.update("tied", TaskState::Killed);
+    controller.set_away(false);
+    assert_eq!(controller.wait_end("tied").reason, "Disconnected");
+}
