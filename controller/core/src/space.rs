@@ -46,10 +46,12 @@ impl Hasher for CellHasher {
     }
 }
 
+type Cells = HashMap<Cell, Vec<(Slot, Point3<f64>)>, BuildHasherDefault<CellHasher>>;
+
 /// Robots of one map, by position.
 #[derive(Debug, Clone, Default)]
 struct Grid {
-    cells: HashMap<Cell, Vec<(Slot, Point3<f64>)>, BuildHasherDefault<CellHasher>>,
+    cells: Cells,
     /// Bounds of all cells that ever held a robot: where rings may stop.
     low: Option<(Cell, Cell)>,
 }
