@@ -230,17 +230,24 @@ impl Driver {
         AttemptId { uid: workload.uid.clone(), attempt: workload.attempt }
     }
 
-    /// Keeps the task's socket and what is known of it as an executor. Before anything is started,
-    /// and after the kernel has shown an end.
+    /// Keeps what is known of the task as an executor: before anything is started, and after the
+    /// kernel has shown an end.
     async fn attend(&mut self) {
         let workload = &self.record.workload;
-        if Kind::of(&self.record.assignment.spec) == Kind::Work {
-            return;
-        }
-        self.shared.desks.live(workload).await;
         if !workload.state.may_be_live() {
             self.seat = None;
-        } else if self.seat.is_none() {
+        }
+        if Kind::of(&self.record.assignment.spec) != Kind::Work {
+            self.shared.desks.live(workload).await;
+        }
+    }
+
+    /// Listens for the task as an executor, while it may live. After its record is durable: that
+    /// makes the directory, and makes the directory durable.
+    fn listen(&mut self) {
+        let workload = &self.record.workload;
+        let work = Kind::of(&self.record.assignment.spec) == Kind::Work;
+        if workload.state.may_be_live() && self.seat.is_none() && !work {
             let dir = self.shared.checkpoint.task_dir(&workload.uid).join(executor::DIR);
             let (desks, token) = (Arc::clone(&self.shared.desks), self.record.token.clone());
             match Seat::open(desks, workload.uid.clone(), &dir, token) {
@@ -256,7 +263,10 @@ impl Driver {
         self.attend().await;
         for effect in response.effects {
             match effect {
-                Effect::Persist => self.persist().await,
+                Effect::Persist => {
+                    self.persist().await;
+                    self.listen();
+                }
                 Effect::Publish => publish(&self.shared, &self.record),
                 Effect::WakeAt(at) => {
                     self.wakes.insert(at);

@@ -271,6 +271,9 @@ impl Executor {
         let mut effects = Vec::new();
         match event {
             Event::Life(life) => self.on_life(life, now, &mut effects),
+            // The last words of an earlier life may come late, and their numbers mean nothing now.
+            Event::Registered { .. } if self.life == Life::Gone => {}
+            Event::Said(_) if !self.connected => {}
             Event::Registered { works, unacknowledged } => {
                 self.on_registered(&works, unacknowledged, now, &mut effects);
             }
@@ -524,6 +527,22 @@ mod tests {
         assert_eq!(end_of(&executor, "a"), None, "it still ends");
         assert!(executor.handle(Event::Life(Life::Live(2)), at(2)).is_empty());
         assert_eq!(end_of(&executor, "a"), Some(End::Lost(Loss::Executor)));
+    }
+
+    #[test]
+    fn the_last_words_of_an_earlier_life_are_not_heard_in_the_next() {
+        let mut executor = busy();
+        let _ = executor.handle(Event::Life(Life::Gone), at(1));
+        let update = Update { work: uid("a"), sequence: 9, state: over() };
+        let late = Event::Registered { works: BTreeSet::new(), unacknowledged: vec![update] };
+        assert!(executor.handle(late, at(1)).is_empty());
+        let _ = executor.handle(Event::Life(Life::Live(2)), at(2));
+        assert!(executor.handle(said("a", 9, over()), at(2)).is_empty());
+        let _ = executor.handle(registered(&[]), at(2));
+        let _ = executor.handle(Event::Claim(uid("a"), 2), at(3));
+        let _ = executor.handle(Event::Recorded(uid("a")), at(3));
+        let _ = executor.handle(said("a", 1, over()), at(4));
+        assert!(end_of(&executor, "a").is_some(), "the next life counts from 1");
     }
 
     #[test]

@@ -42,17 +42,21 @@ impl Seat {
         token: String,
     ) -> io::Result<Seat> {
         // Not the task's: whoever could write here could have the agent change the mode of a file.
-        fs::DirBuilder::new().recursive(true).mode(0o711).create(dir)?;
+        unless(io::ErrorKind::AlreadyExists, fs::DirBuilder::new().mode(0o711).create(dir))?;
         let path = dir.join(super::SOCKET);
-        match fs::remove_file(&path) {
-            Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(error),
-            _ => {}
-        }
+        unless(io::ErrorKind::NotFound, fs::remove_file(&path))?;
         let listener = UnixListener::bind(&path)?;
         // The task may be another user's, and in a container anybody's: the token says who it is.
         fs::set_permissions(&path, fs::Permissions::from_mode(0o666))?;
         let serving = tokio::spawn(serve(desks, uid, listener, token));
         Ok(Seat { _serving: AbortOnDropHandle::new(serving) })
+    }
+}
+
+fn unless(harmless: io::ErrorKind, done: io::Result<()>) -> io::Result<()> {
+    match done {
+        Err(error) if error.kind() == harmless => Ok(()),
+        done => done,
     }
 }
 

@@ -53,6 +53,7 @@ impl WorkRuntime {
             Launched::Refused(Failure { reason: reason.to_owned(), message, retry: true })
         };
         let mut changes = self.desks.changes();
+        // Before the first await: a stop or a watch that the driver asks for after this finds the work.
         let Some(executor) = self.desks.claim(launch) else {
             return refused("ExecutorAway", "its executor went away".to_owned());
         };
