@@ -1,4 +1,5 @@
-//! Frameworks for tests: `tests/frameworks/puppet.py` on the Python SDK, one process a framework.
+//! Frameworks for tests: `tests/frameworks/puppet.py` on the Python SDK, one process a framework; and its executor,
+//! `worker.py`.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -12,7 +13,12 @@ use crate::Cluster;
 use crate::wait::DEADLINE;
 
 /// The Python that has the SDK: `tests/run` makes it.
-fn python() -> PathBuf {
+///
+/// # Panics
+///
+/// When it is not there.
+#[must_use]
+pub fn python() -> PathBuf {
     let python = PathBuf::from(concat!(env!("CARGO_MANIFEST_DIR"), "/../target/python/bin/python"));
     assert!(python.exists(), "{} is missing; tests/run makes it", python.display());
     python

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use muster_api::phase::TaskPhase;
-use muster_tests::{AgentOptions, Cluster, Puppet, wait};
+use muster_tests::{AgentOptions, Cluster, Puppet, puppet, wait};
 use serde_json::{Value, json};
 
 fn spec(cpu: Option<&str>, sensors: &[&str], actuators: &[&str]) -> Value {
@@ -151,4 +151,53 @@ async fn a_framework_fails_over_or_its_tasks_end() {
     gone.await;
     let mut late = Puppet::start(&cluster, json!({"name": "other"})).await;
     late.holds("the robot's actuators", |o| list(o, "slave-1", "actuators") == 2).await;
+}
+
+/// An executor stays alive and runs several tasks; what it holds for them ends with it.
+#[tokio::test(flavor = "multi_thread")]
+async fn an_executor_runs_tasks_and_talks_to_its_framework() {
+    let cluster = two_robots().await;
+    let mut framework = Puppet::start(&cluster, json!({"name": "crew"})).await;
+    framework.holds("offers", |o| o.len() == 2).await;
+    let worker = concat!(env!("CARGO_MANIFEST_DIR"), "/frameworks/worker.py");
+    let executor = json!({
+        "resources": {"cpu": "200m", "memory": "256Mi"},
+        "run": {"process": {"command": [puppet::python(), worker]}},
+    });
+    let launched = framework.launch(&[("slave-1", "worker", executor)]).await;
+    assert_eq!(launched["event"], "launched", "{launched}");
+    let ready = framework.event("ready", |e| e["event"] == "message" && e["data"] == "ready").await;
+    assert_eq!(ready["executor"], launched["tasks"]["worker"]);
+    assert_eq!(ready["node"], "slave-1");
+
+    let work = json!({
+        "resources": {"cpu": "100m", "actuators": ["base:Drive"]},
+        "run": {"executor": {"task": "worker", "data": {"goal": [1, 2]}}},
+    });
+    let elsewhere = framework.launch(&[("slave-2", "lost", work.clone())]).await;
+    assert_eq!(elsewhere["reason"], "CONFLICT", "its executor is not there: {elsewhere}");
+    framework.holds("what is left", |o| cpu(o, "slave-1") == Some(800)).await;
+    let launched = framework.launch(&[("slave-1", "work-1", work.clone())]).await;
+    assert_eq!(launched["event"], "launched", "{launched}");
+    framework.hears("work-1", "RUNNING").await;
+    let status = cluster.phase("work-1", TaskPhase::Running).await.status.expect("running");
+    assert_eq!(status.lease.map(|l| l.epoch.0), Some(1), "work may drive");
+
+    let to = |data: &str| json!({"do": "message", "executor": ready["executor"], "data": data});
+    framework.order(to("grüße")).await;
+    framework.event("an echo", |e| e["event"] == "message" && e["data"] == "grüße").await;
+    framework.order(to("finish work-1")).await;
+    framework.hears("work-1", "SUCCEEDED").await;
+    framework.holds("the actuators again", |o| list(o, "slave-1", "actuators") == 2).await;
+
+    // With its executor gone, nobody does the work any more.
+    let launched = framework.launch(&[("slave-1", "work-2", work)]).await;
+    assert_eq!(launched["event"], "launched", "{launched}");
+    framework.hears("work-2", "RUNNING").await;
+    framework.order(json!({"do": "kill", "task": ready["executor"], "grace": 0})).await;
+    let end = framework
+        .event("the end of work-2", |e| e["name"] == "work-2" && e["state"] == "FAILED")
+        .await;
+    assert_eq!(end["reason"], "ExecutorLost");
+    framework.holds("the actuators at last", |o| list(o, "slave-1", "actuators") == 2).await;
 }
