@@ -35,6 +35,11 @@ fn list(offers: &BTreeMap<String, Value>, node: &str, what: &str) -> usize {
     offers.get(node).and_then(|o| o[what].as_array()).map_or(0, Vec::len)
 }
 
+/// Metres from the frameworks' position.
+fn one_score(node: &str) -> Option<f64> {
+    Some(if node == "slave-1" { 0.0 } else { 10.0 })
+}
+
 /// Steps 1 to 7 of Avalon, III-D: what is offered after each.
 #[tokio::test(flavor = "multi_thread")]
 async fn figure_4_of_avalon_with_frameworks() {
@@ -65,6 +70,7 @@ async fn figure_4_of_avalon_with_frameworks() {
         one.hears(task, "RUNNING").await;
         let status = cluster.phase(task, TaskPhase::Running).await.status.expect("running");
         assert_eq!(status.node.as_deref(), Some(node));
+        assert_eq!(status.score, one_score(node), "the offer's");
         assert_eq!(status.lease.map(|l| (l.name, l.epoch.0)), Some((format!("{node}.body"), 1)));
     }
 

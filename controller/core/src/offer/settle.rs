@@ -13,7 +13,7 @@ use muster_api::kind::task::TaskSpec;
 use muster_api::name::NodeName;
 
 use super::book::Book;
-use super::{GATHER, OfferId, Rescinded, Seat};
+use super::{GATHER, OfferId, Rescinded, Seat, allocator};
 use crate::cluster::Cluster;
 use crate::fairness::{Accounts, OverQuota, namespace_of};
 use crate::node_health::Monotonic;
@@ -188,7 +188,14 @@ impl Book {
                 None => Err(Denied::NotNamed { launch: i }),
             };
             match bound {
-                Ok(bind) => binds.push(bind),
+                Ok(mut bind) => {
+                    // A task that says nothing of where it works has the score of its offer.
+                    let facts = slot.and_then(|slot| cluster.at(slot).facts.as_ref());
+                    let wish = self.wish(order.seat);
+                    let offered = facts.zip(wish).and_then(|(f, w)| allocator::score(f, w));
+                    bind.score = bind.score.or(offered);
+                    binds.push(bind);
+                }
                 Err(denied) => {
                     for (bind, launch) in binds.iter().zip(&order.launches) {
                         cluster.undo(&bind.uid);
