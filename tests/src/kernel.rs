@@ -33,6 +33,18 @@ pub fn with_env(name: &str, value: &str) -> Vec<Process> {
     found
 }
 
+/// Freezes a process (SIGSTOP) or lets it go on (SIGCONT).
+///
+/// # Panics
+///
+/// When there is no such process.
+pub fn freeze(pid: u32, frozen: bool) {
+    use rustix::process::{Pid, Signal, kill_process};
+    let pid = i32::try_from(pid).ok().and_then(Pid::from_raw).expect("a process number");
+    let signal = if frozen { Signal::STOP } else { Signal::CONT };
+    kill_process(pid, signal).expect("it is there");
+}
+
 /// When a live process started; none for one that is gone or a zombie.
 #[must_use]
 pub fn start_time(pid: u32) -> Option<u64> {

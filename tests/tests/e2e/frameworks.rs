@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use muster_api::phase::TaskPhase;
-use muster_tests::{AgentOptions, Cluster, Puppet, puppet, wait};
+use muster_tests::{AgentOptions, Cluster, Puppet, kernel, puppet, wait};
 use serde_json::{Value, json};
 
 fn spec(cpu: Option<&str>, sensors: &[&str], actuators: &[&str]) -> Value {
@@ -206,4 +206,36 @@ async fn an_executor_runs_tasks_and_talks_to_its_framework() {
         .await;
     assert_eq!(end["reason"], "ExecutorLost");
     framework.holds("the actuators at last", |o| list(o, "slave-1", "actuators") == 2).await;
+}
+
+/// A framework that does not answer (SIGSTOP) holds offers of everything and holds nobody up; when it goes on, it is told what
+/// is so now.
+#[tokio::test(flavor = "multi_thread")]
+async fn a_frozen_framework_delays_nobody() {
+    let cluster = two_robots().await;
+    let mut frozen = Puppet::start(&cluster, json!({"name": "frozen"})).await;
+    frozen.holds("both robots", |o| o.len() == 2).await;
+    kernel::freeze(frozen.pid(), true);
+
+    let mut lively =
+        Puppet::start(&cluster, json!({"name": "lively", "namespace": "default"})).await;
+    for round in 1..=5 {
+        lively.holds("a robot to drive", |o| list(o, "slave-1", "actuators") == 2).await;
+        let name = format!("drive-{round}");
+        let drive = spec(Some("700m"), &[], &["base:Drive"]);
+        let launched = lively.launch(&[("slave-1", &name, drive)]).await;
+        assert_eq!(launched["event"], "launched", "{launched}");
+        lively.hears(&name, "RUNNING").await;
+        lively.holds("what is left", |o| cpu(o, "slave-1") == Some(300)).await;
+        if round < 5 {
+            lively.order(json!({"do": "kill", "task": launched["tasks"][&name], "grace": 0})).await;
+            lively.hears(&name, "FAILED").await;
+        }
+    }
+
+    kernel::freeze(frozen.pid(), false);
+    let rest = |o: &BTreeMap<String, Value>| {
+        cpu(o, "slave-1") == Some(300) && list(o, "slave-1", "actuators") == 0
+    };
+    frozen.holds("what the other left", rest).await;
 }
