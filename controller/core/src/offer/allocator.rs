@@ -8,11 +8,12 @@ use std::fmt;
 
 use muster_api::kind::node::{NodeKind, TaintEffect};
 use muster_api::kind::task::{Cost, NodeChoice};
-use muster_api::name::FunctionName;
 
 use super::Wish;
 use crate::cluster::{Cluster, Member, NodeFacts};
 use crate::report::Refusal;
+use crate::schedule::filter;
+use crate::schedule::score::score_at;
 use crate::space::Slot;
 
 /// A node that a framework may be offered.
@@ -99,12 +100,7 @@ fn in_range<'a>(cluster: &'a Cluster, wish: &Wish) -> impl Iterator<Item = Candi
 /// The score of a robot for a framework: metres or seconds to the operation position. None: nothing to score by.
 #[must_use]
 pub fn score(facts: &NodeFacts, wish: &Wish) -> Option<f64> {
-    let at = wish.position.as_ref().filter(|_| facts.kind == NodeKind::Robot)?;
-    let distance = at.distance_to(facts.pose.as_ref()?)?;
-    match wish.cost {
-        Cost::Distance => Some(distance),
-        Cost::TravelTime => Some(distance / facts.speed?),
-    }
+    score_at(facts, wish.position.as_ref(), wish.cost)
 }
 
 /// Why a node is not offered to a framework; none: it can be.
@@ -117,20 +113,7 @@ pub fn refusal(member: &Member, wish: &Wish) -> Option<Refusal> {
 #[must_use]
 pub fn reach_refusal(member: &Member, wish: &Wish) -> Option<Refusal> {
     let facts = member.facts.as_ref()?;
-    let at = wish.position.as_ref().filter(|_| facts.kind == NodeKind::Robot)?;
-    let Some(pose) = &facts.pose else {
-        return Some(Refusal::NoPose);
-    };
-    if !pose.localized {
-        return Some(Refusal::NotLocalized);
-    }
-    let Some(distance) = at.distance_to(pose) else {
-        return Some(Refusal::OtherMap { robot: pose.map.clone(), wanted: at.map.clone() });
-    };
-    if distance > wish.radius {
-        return Some(Refusal::OutOfRange { distance, within: wish.radius });
-    }
-    (wish.cost == Cost::TravelTime && facts.speed.is_none()).then_some(Refusal::NoSpeed)
+    filter::reach_of(facts, wish.position.as_ref(), wish.radius, wish.cost)
 }
 
 /// Everything but the range: what the node is, whether it takes work, what is left of it.
@@ -164,16 +147,9 @@ pub fn holdings_refusal(member: &Member, wish: &Wish) -> Option<Refusal> {
 }
 
 fn functions_refusal(member: &Member, facts: &NodeFacts, wish: &Wish) -> Option<Refusal> {
-    let lacking = |asked: &[FunctionName], has: &std::collections::BTreeSet<FunctionName>| {
-        asked.iter().filter(|f| !has.contains(*f)).cloned().collect::<Vec<_>>()
-    };
-    let missing = lacking(&wish.filter.sensors, &facts.sensors);
-    if !missing.is_empty() {
-        return Some(Refusal::NoSensor { missing });
-    }
-    let missing = lacking(&wish.filter.actuators, &facts.actuators);
-    if !missing.is_empty() {
-        return Some(Refusal::NoActuator { missing });
+    let lacking = filter::functions(facts, &wish.filter.sensors, &wish.filter.actuators);
+    if lacking.is_some() {
+        return lacking;
     }
     if !wish.filter.any_actuator && wish.filter.actuators.is_empty() {
         return None;

@@ -1,9 +1,12 @@
 //! Which nodes can take a task at all. The filters stand in the order of how hard their reasons are
 //! to change, so that the first refusal is the one worth reading.
 
+use std::collections::BTreeSet;
+
 use muster_api::kind::node::{NodeKind, TaintEffect};
 use muster_api::kind::task::{Cost, NodeChoice, TaskSpec};
 use muster_api::name::FunctionName;
+use muster_api::pose::OperationPosition;
 
 use super::Demand;
 use crate::cluster::{Member, NodeFacts};
@@ -58,16 +61,23 @@ fn abilities(facts: &NodeFacts, spec: &TaskSpec) -> Option<Refusal> {
         let message = offered.map(|r| r.message.clone()).unwrap_or_default();
         return Some(Refusal::NoRuntime { runtime, message });
     }
-    let lacking = |asked: &[FunctionName],
-                   has: &std::collections::BTreeSet<FunctionName>|
-     -> Vec<FunctionName> {
+    functions(facts, &spec.resources.sensors, &spec.resources.actuators)
+}
+
+/// The first sort of functions, SR before AR, of which the node lacks some.
+pub(crate) fn functions(
+    facts: &NodeFacts,
+    sensors: &[FunctionName],
+    actuators: &[FunctionName],
+) -> Option<Refusal> {
+    let lacking = |asked: &[FunctionName], has: &BTreeSet<FunctionName>| -> Vec<FunctionName> {
         asked.iter().filter(|f| !has.contains(*f)).cloned().collect()
     };
-    let missing = lacking(&spec.resources.sensors, &facts.sensors);
+    let missing = lacking(sensors, &facts.sensors);
     if !missing.is_empty() {
         return Some(Refusal::NoSensor { missing });
     }
-    let missing = lacking(&spec.resources.actuators, &facts.actuators);
+    let missing = lacking(actuators, &facts.actuators);
     (!missing.is_empty()).then_some(Refusal::NoActuator { missing })
 }
 
@@ -94,7 +104,19 @@ fn admission(facts: &NodeFacts, spec: &TaskSpec) -> Option<Refusal> {
 
 /// The range filter (Avalon, Alg. 1). Cloud nodes have no pose; it does not apply to them.
 fn reach(facts: &NodeFacts, spec: &TaskSpec) -> Option<Refusal> {
-    let at = spec.placement.at.as_ref().filter(|_| facts.kind == NodeKind::Robot)?;
+    let placement = &spec.placement;
+    let within = placement.within.unwrap_or(f64::INFINITY);
+    reach_of(facts, placement.at.as_ref(), within, placement.cost)
+}
+
+/// The same for any operation position, radius in metres and cost, a task's or a framework's.
+pub(crate) fn reach_of(
+    facts: &NodeFacts,
+    at: Option<&OperationPosition>,
+    within: f64,
+    cost: Cost,
+) -> Option<Refusal> {
+    let at = at.filter(|_| facts.kind == NodeKind::Robot)?;
     let Some(pose) = &facts.pose else {
         return Some(Refusal::NoPose);
     };
@@ -104,10 +126,10 @@ fn reach(facts: &NodeFacts, spec: &TaskSpec) -> Option<Refusal> {
     let Some(distance) = at.distance_to(pose) else {
         return Some(Refusal::OtherMap { robot: pose.map.clone(), wanted: at.map.clone() });
     };
-    if let Some(within) = spec.placement.within.filter(|w| distance > *w) {
+    if distance > within {
         return Some(Refusal::OutOfRange { distance, within });
     }
-    (spec.placement.cost == Cost::TravelTime && facts.speed.is_none()).then_some(Refusal::NoSpeed)
+    (cost == Cost::TravelTime && facts.speed.is_none()).then_some(Refusal::NoSpeed)
 }
 
 fn what_is_left(member: &Member, facts: &NodeFacts, demand: &Demand) -> Option<Refusal> {

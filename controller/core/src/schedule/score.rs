@@ -2,6 +2,7 @@
 
 use muster_api::kind::node::NodeKind;
 use muster_api::kind::task::{Cost, TaskSpec};
+use muster_api::pose::OperationPosition;
 
 use crate::cluster::NodeFacts;
 
@@ -10,9 +11,15 @@ use crate::cluster::NodeFacts;
 /// cloud node or the task has no operation position.
 #[must_use]
 pub fn score(facts: &NodeFacts, spec: &TaskSpec) -> Option<f64> {
-    let at = spec.placement.at.as_ref().filter(|_| facts.kind == NodeKind::Robot)?;
+    score_at(facts, spec.placement.at.as_ref(), spec.placement.cost)
+}
+
+/// The same for any operation position and cost, a task's or a framework's.
+#[must_use]
+pub fn score_at(facts: &NodeFacts, at: Option<&OperationPosition>, cost: Cost) -> Option<f64> {
+    let at = at.filter(|_| facts.kind == NodeKind::Robot)?;
     let distance = at.distance_to(facts.pose.as_ref()?)?;
-    match spec.placement.cost {
+    match cost {
         Cost::Distance => Some(distance),
         Cost::TravelTime => Some(distance / facts.speed?),
     }
