@@ -50,6 +50,9 @@ pub struct Context {
     pub stop: CancellationToken,
     /// Takes what people should see under an object.
     pub events: Recorder,
+    /// Held while a task is given to a node (shared) and while a Node is deleted (alone): a Node is found unused and is
+    /// gone before the next task is given to it, or the other way round.
+    pub(crate) placing: tokio::sync::RwLock<()>,
     pub(crate) metrics: PrometheusHandle,
     logs: OnceLock<Arc<dyn LogSource>>,
     live: OnceLock<Live>,
@@ -83,6 +86,7 @@ impl Context {
             address,
             stop: CancellationToken::new(),
             events,
+            placing: tokio::sync::RwLock::new(()),
             metrics,
             logs: OnceLock::new(),
             live: OnceLock::new(),

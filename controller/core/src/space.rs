@@ -1,33 +1,45 @@
-//! Which robots are nearest: a hash grid per map over live poses.
+//! Which robots are nearest: a grid of two levels per map over live poses.
 //!
-//! A robot that moves inside its cell costs a write, one that changes cell two. A query walks rings
-//! of cells outwards from the position and stops as soon as no farther ring can hold anything nearer.
-//! Cells are columns: height counts in distances (robots on several floors), not in the grid.
+//! A map's floor is cut into tiles, found by a hash, and a tile into cells. A tile keeps its robots in one slice ordered by
+//! cell, row by row, so that a query reads the part of each row that its circle covers as one run of memory.
+//! A robot that moves inside its cell costs a write, one that changes cell moves its tile's robots between the two.
+//!
+//! A query reads circles that double, and gives what each adds in order of distance: who asks for the nearest of a large
+//! radius pays for a small one. Cells are columns: height counts in distances (robots on several floors), not in the grid.
 
-use std::cmp::Ordering;
-use std::collections::{BinaryHeap, HashMap};
+use std::collections::HashMap;
 use std::hash::{BuildHasherDefault, Hasher};
 
 use nalgebra::Point3;
 
-/// Side of a cell, metres. Radii of work in a building are 5 to 50 m: a query then touches about ten cells, and a cell of
-/// a busy hall (one robot per 100 m²) holds four robots. With sides of 10 m the benchmark `offers` is slower.
-const CELL: f64 = 20.0;
+/// Side of a cell, metres. Radii of work in a building are 5 to 50 m; smaller cells follow the circle more closely and
+/// make more rows to read. The benchmark `offers` is slower with 5 m and with 20 m.
+const CELL: f64 = 10.0;
 
-/// Room for the robots of the first rings, so that a query allocates once.
-const READY: usize = 64;
+/// Cells along a tile's side.
+const SIDE: i64 = 8;
+
+/// Cells of a tile.
+const CELLS: usize = (SIDE * SIDE) as usize;
+
+/// Radius of a query's first circle, metres.
+const FIRST: f64 = 25.0;
+
+/// Rounding of a sum of coordinates, relative to them: a circle's bounds are widened by it, so that a robot whose distance
+/// rounds to the radius is inside. Coarser than `f64`'s own by four digits.
+const SLACK: f64 = 1e-12;
 
 /// Number of a node in the cluster's table; the index knows nothing else of it.
 pub type Slot = u32;
 
-type Cell = (i32, i32);
+/// Column and row, of a cell or of a tile.
+type Key = (i32, i32);
 
-/// Mixes the two numbers of a cell by multiplication. The keys are our own, so nobody can choose them to collide, and
-/// a query that walks fifty cells spends its time on distances instead of on hashes.
+/// Mixes the two numbers of a tile by multiplication. The keys are our own, so nobody can choose them to collide.
 #[derive(Debug, Clone, Copy, Default)]
-struct CellHasher(u64);
+struct TileHasher(u64);
 
-impl Hasher for CellHasher {
+impl Hasher for TileHasher {
     fn finish(&self) -> u64 {
         // The table takes its bucket from the low bits and its tag from the high ones.
         self.0 ^ (self.0 >> 32)
@@ -46,14 +58,101 @@ impl Hasher for CellHasher {
     }
 }
 
-type Cells = HashMap<Cell, Vec<(Slot, Point3<f64>)>, BuildHasherDefault<CellHasher>>;
+/// One robot in its tile.
+type Entry = (Slot, Point3<f64>);
+
+/// A square of cells with robots.
+#[derive(Debug, Clone)]
+struct Tile {
+    /// Ordered by cell.
+    robots: Vec<Entry>,
+    /// Where each cell's robots begin; the last number is how many there are.
+    begin: [u32; CELLS + 1],
+}
+
+impl Tile {
+    fn new() -> Self {
+        Self { robots: Vec::new(), begin: [0; CELLS + 1] }
+    }
+
+    fn insert(&mut self, cell: usize, entry: Entry) {
+        self.robots.insert(self.begin[cell + 1] as usize, entry);
+        self.begin[cell + 1..].iter_mut().for_each(|b| *b += 1);
+    }
+
+    fn index_of(&self, cell: usize, slot: Slot) -> usize {
+        let (from, to) = (self.begin[cell] as usize, self.begin[cell + 1] as usize);
+        let inside = self.robots[from..to].iter().position(|(s, _)| *s == slot);
+        from + inside.expect("a robot is in the cell of its place")
+    }
+
+    fn remove(&mut self, cell: usize, slot: Slot) {
+        self.robots.remove(self.index_of(cell, slot));
+        self.begin[cell + 1..].iter_mut().for_each(|b| *b -= 1);
+    }
+
+    /// The robots of a row's cells `from..=to`.
+    fn row(&self, row: usize, from: usize, to: usize) -> &[Entry] {
+        let first = row * SIDE as usize;
+        &self.robots[self.begin[first + from] as usize..self.begin[first + to + 1] as usize]
+    }
+}
 
 /// Robots of one map, by position.
 #[derive(Debug, Clone, Default)]
 struct Grid {
-    cells: Cells,
-    /// Bounds of all cells that ever held a robot: where rings may stop.
-    low: Option<(Cell, Cell)>,
+    /// Tiles that hold a robot.
+    tiles: HashMap<Key, Box<Tile>, BuildHasherDefault<TileHasher>>,
+    robots: usize,
+}
+
+impl Grid {
+    fn insert(&mut self, entry: Entry) {
+        let (tile, cell) = place_of(&entry.1);
+        self.tiles.entry(tile).or_insert_with(|| Box::new(Tile::new())).insert(cell, entry);
+        self.robots += 1;
+    }
+
+    fn remove(&mut self, (slot, position): Entry) {
+        let (key, cell) = place_of(&position);
+        let tile = self.tiles.get_mut(&key).expect("a robot is in the tile of its place");
+        tile.remove(cell, slot);
+        if tile.robots.is_empty() {
+            self.tiles.remove(&key);
+        }
+        self.robots -= 1;
+    }
+
+    /// Moves a robot inside its tile.
+    fn shift(&mut self, slot: Slot, from: &Point3<f64>, to: Point3<f64>) {
+        let ((key, old), (_, new)) = (place_of(from), place_of(&to));
+        let tile = self.tiles.get_mut(&key).expect("a robot is in the tile of its place");
+        if old == new {
+            let index = tile.index_of(old, slot);
+            tile.robots[index].1 = to;
+        } else {
+            tile.remove(old, slot);
+            tile.insert(new, (slot, to));
+        }
+    }
+}
+
+/// Number of the cell along one axis. Saturating: beyond 2^31 cells a position lands in the last one, and is still
+/// compared by its true distance.
+fn cell_of(coordinate: f64) -> i32 {
+    (coordinate / CELL).floor() as i32
+}
+
+fn tile_of(cell: i32) -> i32 {
+    cell.div_euclid(SIDE as i32)
+}
+
+/// The tile of a position, and the cell in it.
+fn place_of(position: &Point3<f64>) -> (Key, usize) {
+    let (x, y) = (cell_of(position.x), cell_of(position.y));
+    let side = SIDE as i32;
+    let cell = y.rem_euclid(side) * side + x.rem_euclid(side);
+    ((tile_of(x), tile_of(y)), cell as usize)
 }
 
 /// Where one robot is: its map's number, and its position there.
@@ -70,7 +169,7 @@ pub struct Space {
 }
 
 /// A robot that a query found.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Found {
     /// The robot.
     pub slot: Slot,
@@ -78,58 +177,25 @@ pub struct Found {
     pub distance: f64,
 }
 
-/// The greatest of all is the nearest, as a [`BinaryHeap`] gives the greatest first.
-impl Ord for Found {
-    fn cmp(&self, other: &Self) -> Ordering {
-        other.distance.total_cmp(&self.distance).then(other.slot.cmp(&self.slot))
-    }
-}
-
-impl PartialOrd for Found {
-    fn partial_cmp(&self, other: &Self) -> Option<Ordering> {
-        Some(self.cmp(other))
-    }
-}
-
-impl PartialEq for Found {
-    fn eq(&self, other: &Self) -> bool {
-        self.cmp(other).is_eq()
-    }
-}
-
-impl Eq for Found {}
-
-fn cell_of(position: &Point3<f64>) -> Cell {
-    // Saturating: a position beyond 2^31 cells lands in the last one, and is still compared by its
-    // true distance.
-    ((position.x / CELL).floor() as i32, (position.y / CELL).floor() as i32)
-}
-
 impl Space {
     /// Puts or moves a robot. The position is in the frame of `map`, metres, finite.
     pub fn insert(&mut self, slot: Slot, map: &str, position: Point3<f64>) {
-        let (map, cell) = (self.number_of(map), cell_of(&position));
+        let map = self.number_of(map);
         let index = slot as usize;
         if self.places.len() <= index {
             self.places.resize(index + 1, None);
         }
-        match &mut self.places[index] {
-            Some((old_map, old)) if *old_map == map && cell_of(old) == cell => {
-                *old = position;
-                let entries = self.grids[map].cells.get_mut(&cell);
-                let entry = entries.and_then(|c| c.iter_mut().find(|(s, _)| *s == slot));
-                entry.expect("a robot is in the cell of its place").1 = position;
-                return;
+        match self.places[index].replace((map, position)) {
+            Some((old_map, old)) if old_map == map && place_of(&old).0 == place_of(&position).0 => {
+                self.grids[map].shift(slot, &old, position);
             }
-            Some(_) => self.remove(slot),
-            None => {}
+            old => {
+                if let Some((old_map, old)) = old {
+                    self.grids[old_map].remove((slot, old));
+                }
+                self.grids[map].insert((slot, position));
+            }
         }
-        let grid = &mut self.grids[map];
-        grid.cells.entry(cell).or_default().push((slot, position));
-        let (low, high) = grid.low.get_or_insert((cell, cell));
-        *low = (low.0.min(cell.0), low.1.min(cell.1));
-        *high = (high.0.max(cell.0), high.1.max(cell.1));
-        self.places[index] = Some((map, position));
     }
 
     fn number_of(&mut self, map: &str) -> usize {
@@ -144,12 +210,8 @@ impl Space {
     /// Takes a robot out.
     pub fn remove(&mut self, slot: Slot) {
         let place = self.places.get_mut(slot as usize).and_then(Option::take);
-        let Some((map, position)) = place else { return };
-        let (cells, cell) = (&mut self.grids[map].cells, cell_of(&position));
-        let entries = cells.get_mut(&cell).expect("a robot is in the cell of its place");
-        entries.retain(|(s, _)| *s != slot);
-        if entries.is_empty() {
-            cells.remove(&cell);
+        if let Some((map, position)) = place {
+            self.grids[map].remove((slot, position));
         }
     }
 
@@ -158,93 +220,58 @@ impl Space {
     /// only as far as it is taken.
     #[must_use]
     pub fn nearest(&self, map: &str, at: Point3<f64>, radius: f64) -> Nearest<'_> {
-        Nearest {
-            grid: self.maps.get(map).map(|number| &self.grids[*number]),
-            at,
-            radius,
-            ring: 0,
-            ready: BinaryHeap::with_capacity(READY),
-            done: false,
-        }
+        let grid = self.maps.get(map).map(|number| &self.grids[*number]);
+        Nearest { grid, at, radius, seen: -1.0, found: 0, ready: Vec::new() }
     }
 }
 
 /// Robots by distance; see [`Space::nearest`].
 #[derive(Debug)]
 pub struct Nearest<'a> {
+    /// None when everything has been found.
     grid: Option<&'a Grid>,
     at: Point3<f64>,
     radius: f64,
-    /// The next ring of cells to look into.
-    ring: i64,
-    /// Found and not yet given. A heap: a dense ring holds hundreds, of which mostly one is taken.
-    ready: BinaryHeap<Found>,
-    done: bool,
+    /// Every robot up to this distance has been found; negative before the first circle.
+    seen: f64,
+    /// How many that are.
+    found: usize,
+    /// Found and not yet given; the nearest last.
+    ready: Vec<Found>,
 }
 
 impl Nearest<'_> {
-    /// Every robot nearer than this has been found: the edge of the rings looked into.
-    fn certain(&self) -> f64 {
-        let (cx, cy) = cell_of(&self.at);
-        let inner = (self.ring - 1) as f64;
-        let edge = |coordinate: f64, cell: i32| {
-            let into = coordinate - f64::from(cell) * CELL;
-            into.min(CELL - into)
-        };
-        inner * CELL + edge(self.at.x, cx).min(edge(self.at.y, cy)).max(0.0)
-    }
-
-    fn look_into_next_ring(&mut self) {
-        let Some(grid) = self.grid else {
-            self.done = true;
-            return;
-        };
-        let Some((low, high)) = grid.low else {
-            self.done = true;
-            return;
-        };
-        let (cx, cy) = cell_of(&self.at);
-        let (cx, cy, ring) = (i64::from(cx), i64::from(cy), self.ring);
-        let (x0, x1) = (i64::from(low.0), i64::from(high.0));
-        let (y0, y1) = (i64::from(low.1), i64::from(high.1));
-        let mut look = |x: i64, y: i64| {
-            if x < x0 || x > x1 || y < y0 || y > y1 {
-                return;
-            }
-            // Inside the bounds, which are i32.
-            let Some(entries) = grid.cells.get(&(x as i32, y as i32)) else { return };
-            for (slot, position) in entries {
-                let distance = nalgebra::distance(&self.at, position);
-                if distance <= self.radius {
-                    self.ready.push(Found { slot: *slot, distance });
+    /// Reads the next circle.
+    fn widen(&mut self, grid: &Grid) {
+        let reach = if self.seen < 0.0 { FIRST } else { self.seen * 2.0 }.min(self.radius);
+        let circle = Circle::new(self.at, reach);
+        let window = circle.tiles();
+        let ([left, low], [right, high]) = window;
+        let area = (i64::from(right) - i64::from(left) + 1) * (i64::from(high) - i64::from(low) + 1);
+        if area > grid.tiles.len() as i64 {
+            // A circle wider than all robots together.
+            for (key, tile) in &grid.tiles {
+                if (left..=right).contains(&key.0) && (low..=high).contains(&key.1) {
+                    circle.read(*key, tile, self.seen, &mut self.ready);
                 }
             }
-        };
-        // Only the part of the ring inside the bounds is walked: a query far outside of all robots
-        // must not walk millions of empty cells.
-        for x in (cx - ring).max(x0)..=(cx + ring).min(x1) {
-            look(x, cy - ring);
-            if ring > 0 {
-                look(x, cy + ring);
+        } else {
+            for y in low..=high {
+                for x in left..=right {
+                    if let Some(tile) = grid.tiles.get(&(x, y)) {
+                        circle.read((x, y), tile, self.seen, &mut self.ready);
+                    }
+                }
             }
         }
-        for y in (cy - ring + 1).max(y0)..=(cy + ring - 1).min(y1) {
-            look(cx - ring, y);
-            look(cx + ring, y);
+        self.ready.sort_unstable_by(|a, b| {
+            b.distance.total_cmp(&a.distance).then(b.slot.cmp(&a.slot))
+        });
+        self.seen = reach;
+        self.found += self.ready.len();
+        if reach >= self.radius || self.found == grid.robots {
+            self.grid = None;
         }
-        let past_bounds = cx - ring <= x0 && cx + ring >= x1 && cy - ring <= y0 && cy + ring >= y1;
-        self.ring += 1;
-        if past_bounds || self.certain() > self.radius {
-            self.done = true;
-        } else if self.ready.is_empty() {
-            self.skip_to_bounds((x0, x1), (y0, y1), (cx, cy));
-        }
-    }
-
-    /// Rings that lie wholly outside the bounds hold nothing.
-    fn skip_to_bounds(&mut self, (x0, x1): (i64, i64), (y0, y1): (i64, i64), (cx, cy): (i64, i64)) {
-        let outside = |c: i64, low: i64, high: i64| (low - c).max(c - high).max(0);
-        self.ring = self.ring.max(outside(cx, x0, x1).max(outside(cy, y0, y1)));
     }
 }
 
@@ -253,13 +280,67 @@ impl Iterator for Nearest<'_> {
 
     fn next(&mut self) -> Option<Found> {
         loop {
-            match self.ready.peek() {
-                // Strictly less: an equal distance with a smaller slot may still come from the next ring.
-                Some(found) if self.done || found.distance < self.certain() => {
-                    return self.ready.pop();
+            if let Some(found) = self.ready.pop() {
+                return Some(found);
+            }
+            let grid = self.grid?;
+            self.widen(grid);
+        }
+    }
+}
+
+/// What a query reads at once.
+#[derive(Debug)]
+struct Circle {
+    at: Point3<f64>,
+    reach: f64,
+    /// `reach` squared and a little more: most robots outside are told by it, without a root.
+    almost: f64,
+    /// What rounding may add along x and y.
+    slack: [f64; 2],
+}
+
+impl Circle {
+    fn new(at: Point3<f64>, reach: f64) -> Self {
+        let slack = [at.x, at.y].map(|c| (c.abs() + reach) * SLACK);
+        Self { at, reach, almost: reach * reach * (1.0 + 4.0 * f64::EPSILON), slack }
+    }
+
+    /// The cells between `centre - half` and `centre + half`.
+    fn cells(centre: f64, half: f64) -> (i32, i32) {
+        (cell_of(centre - half), cell_of(centre + half))
+    }
+
+    /// The tiles of the square around it: lowest and highest column and row.
+    fn tiles(&self) -> ([i32; 2], [i32; 2]) {
+        let (left, right) = Self::cells(self.at.x, self.reach + self.slack[0]);
+        let (low, high) = Self::cells(self.at.y, self.reach + self.slack[1]);
+        ([left, low].map(tile_of), [right, high].map(tile_of))
+    }
+
+    /// Adds the robots of a tile that are in the circle and farther than `seen`.
+    fn read(&self, (column, row): Key, tile: &Tile, seen: f64, to: &mut Vec<Found>) {
+        // In i64: the last tile's end is beyond i32.
+        let (x0, y0) = (i64::from(column) * SIDE, i64::from(row) * SIDE);
+        let clip = |cell: i32, origin: i64| (i64::from(cell) - origin).clamp(0, SIDE - 1);
+        let (low, high) = Self::cells(self.at.y, self.reach + self.slack[1]);
+        for y in clip(low, y0)..=clip(high, y0) {
+            // How far the circle reaches along x at this row's edge that is nearest to the centre.
+            let bottom = (y0 + y) as f64 * CELL;
+            let off = (bottom - self.at.y).max(self.at.y - (bottom + CELL)).max(0.0);
+            // A row beyond the circle: the last one holds everything that is farther out.
+            let half = if off < self.reach { (self.almost - off * off).sqrt() } else { self.reach };
+            let (left, right) = Self::cells(self.at.x, half + self.slack[0]);
+            let (left, right) = (clip(left, x0) as usize, clip(right, x0) as usize);
+            for (slot, position) in tile.row(y as usize, left, right) {
+                let squared = nalgebra::distance_squared(&self.at, position);
+                if squared > self.almost {
+                    continue;
                 }
-                None if self.done => return None,
-                _ => self.look_into_next_ring(),
+                let distance = squared.sqrt();
+                if distance <= self.reach && distance > seen {
+                    to.push(Found { slot: *slot, distance });
+                }
             }
         }
     }
@@ -308,12 +389,23 @@ mod tests {
         assert_eq!(found, [1]);
     }
 
+    #[test]
+    fn positions_beyond_the_last_cell_are_compared_by_their_distance() {
+        let mut space = Space::default();
+        for (slot, x) in [(1, 0.0), (2, 30.0), (3, 61.0)] {
+            space.insert(slot, "map", Point3::new(x, 2e12, 0.0));
+        }
+        let slots: Vec<Slot> =
+            space.nearest("map", Point3::new(0.0, 2e12, 0.0), 60.0).map(|f| f.slot).collect();
+        assert_eq!(slots, [1, 2]);
+    }
+
     proptest! {
         #[test]
         fn answers_are_those_of_brute_force(
-            moves in proptest::collection::vec((0..24_u32, -60.0..60.0_f64, -60.0..60.0_f64, 0.0..6.0_f64, 0..8_u8), 1..120),
-            at in (-80.0..80.0_f64, -80.0..80.0_f64),
-            radius in prop_oneof![0.0..150.0_f64, Just(f64::INFINITY)],
+            moves in proptest::collection::vec((0..24_u32, -200.0..200.0_f64, -200.0..200.0_f64, 0.0..6.0_f64, 0..8_u8), 1..160),
+            at in (-220.0..220.0_f64, -220.0..220.0_f64),
+            radius in prop_oneof![0.0..450.0_f64, Just(f64::INFINITY)],
         ) {
             let (mut space, mut robots) = (Space::default(), HashMap::new());
             for (slot, x, y, z, what) in moves {

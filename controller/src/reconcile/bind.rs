@@ -9,8 +9,8 @@ use muster_api::phase::TaskPhase;
 use muster_controller_core::schedule::Bind;
 
 use crate::context::Context;
-use crate::objects;
-use crate::store::{Key, Op};
+use crate::objects::{self, NODES};
+use crate::store::{Key, Op, Precondition};
 
 /// The status of a task that was just bound. A task that waited has nothing in its status but why it did, so it is made
 /// anew.
@@ -28,7 +28,7 @@ pub(super) fn status(bind: &Bind, now: Timestamp) -> TaskStatus {
     }
 }
 
-/// The operations that grant a task its leases.
+/// The operations that grant a task its leases, if its node is still there.
 pub(super) fn grants(context: &Context, bind: &Bind, task: &Key, now: Timestamp) -> Vec<Op> {
     let grant = |(group, epoch): &(String, muster_api::id::Epoch)| {
         let holder = LeaseHolder {
@@ -44,7 +44,11 @@ pub(super) fn grants(context: &Context, bind: &Bind, task: &Key, now: Timestamp)
         };
         grant_op(context, bind.node.as_str(), group, status)
     };
-    bind.leases.iter().map(grant).collect()
+    let node = Op::Check {
+        key: Key::cluster(NODES, bind.node.as_str()),
+        precondition: Precondition::PRESENT,
+    };
+    std::iter::once(node).chain(bind.leases.iter().map(grant)).collect()
 }
 
 fn grant_op(context: &Context, node: &str, group: &str, status: LeaseStatus) -> Op {

@@ -278,12 +278,15 @@ impl Desk {
                 let reason = wire::RescindReason::Changed.into();
                 outlet.say(wire::event::Event::Rescind(wire::Rescind { offers, reason }));
             }
-            let seat = self.book.register(wish.clone());
+            let anew = self.book.register(wish.clone());
             if old.is_suppressed(seat) {
-                self.book.suppress(seat);
+                self.book.suppress(anew);
             }
-            self.seats.insert(Arc::clone(&guest.uid), seat);
-            self.guests.insert(seat, guest);
+            if guest.outlet.is_none() {
+                self.book.disconnect(anew);
+            }
+            self.seats.insert(Arc::clone(&guest.uid), anew);
+            self.guests.insert(anew, guest);
         }
     }
 
@@ -425,6 +428,7 @@ impl Desk {
                 Err(denied) => self.deny(order.seat, pending, &denied),
             }
         }
+        let _nodes_stay = self.context.placing.read().await;
         let store = &self.context.store;
         let results = join_all(transactions.into_iter().map(|ops| async move {
             if ops.is_empty() { Ok(Vec::new()) } else { store.apply(ops).await }
@@ -515,7 +519,7 @@ impl Desk {
         let seat = *self.seats.get(uid)?;
         let reasons = self.book.explain(cluster, seat, self.now());
         let refusal = |(node, why): (muster_api::name::NodeName, _)| {
-            let why: muster_controller_core::offer::book::NotOffered = why;
+            let why: muster_controller_core::offer::explain::NotOffered = why;
             NodeRefusal {
                 node: node.to_string(),
                 reason: why.reason().to_owned(),

@@ -6,7 +6,7 @@
 //! ```
 //!
 //! One task owns the cluster, so decisions are made one after the other. A bind is one transaction:
-//! the task's status and the lease it needs, each with the revision it was decided on. When it fails,
+//! the task's status and the lease it needs, each with the revision it was decided on, while the node is there. When it fails,
 //! the reservation is released and the store's next event brings the task back. What this task wrote
 //! itself is known already, and is passed over when the store tells it.
 
@@ -363,6 +363,8 @@ impl Scheduler {
     }
 
     async fn bind_all(&mut self, binds: Vec<Bind>) -> Option<Instant> {
+        let context = Arc::clone(&self.context);
+        let _nodes_stay = context.placing.read().await;
         let results = self.commit(&binds).await;
         let mut retry = None;
         for (bind, result) in binds.into_iter().zip(results) {

@@ -172,6 +172,11 @@ async fn end(
         Some(live) => Some(live.sessions.hold_back().await),
         None => None,
     };
+    // And none is given to it.
+    let _nothing_is_placed = match live {
+        Some(_) => Some(context.placing.write().await),
+        None => None,
+    };
     loop {
         let present = context.store.get(key).ok_or_else(|| Failure::not_found(entry, name))?;
         if entry.info.kind == "Node" {

@@ -33,18 +33,18 @@ const CLOSER_BY_AT_LEAST: f64 = 0.5;
 #[derive(Debug)]
 pub(super) struct Place {
     pub(super) wish: Wish,
-    connected: bool,
-    suppressed: bool,
+    pub(super) connected: bool,
+    pub(super) suppressed: bool,
     pub(super) offers: BTreeMap<Slot, Offer>,
-    refused: HashMap<Slot, Refused>,
+    pub(super) refused: HashMap<Slot, Refused>,
     /// The wish is new since the last look.
     rewished: bool,
 }
 
 /// What a framework does not want to see again for a while.
 #[derive(Debug, Clone)]
-struct Refused {
-    until: Monotonic,
+pub(super) struct Refused {
+    pub(super) until: Monotonic,
     free: Compute,
     actuators_free: bool,
     facts_version: u64,
@@ -491,106 +491,6 @@ impl Book {
         let thaw = self.thaws.first().map(|(at, ..)| *at);
         let gathered = self.gathered.first().map(|(at, _)| *at);
         [expiry, thaw, gathered].into_iter().flatten().min()
-    }
-
-    /// Why each node is not offered to a framework.
-    #[must_use]
-    pub fn explain(
-        &self,
-        cluster: &Cluster,
-        seat: Seat,
-        now: Monotonic,
-    ) -> Vec<(muster_api::name::NodeName, NotOffered)> {
-        let Some(place) = self.places.get(&seat) else { return Vec::new() };
-        let exhausted = cluster.has_quotas()
-            && Accounts::of(cluster).is_exhausted(cluster, &place.wish.namespace);
-        let why = |slot: Slot, member: &Member| {
-            if !place.connected {
-                return NotOffered::Disconnected;
-            }
-            if place.suppressed {
-                return NotOffered::Suppressed;
-            }
-            if exhausted {
-                return NotOffered::Quota;
-            }
-            if let Some(refusal) = allocator::refusal(member, &place.wish) {
-                return NotOffered::Refusal(refusal);
-            }
-            match place.refused.get(&slot) {
-                Some(r) => NotOffered::Declined { left: r.until.saturating_sub(now) },
-                None => NotOffered::NotAmongTheClosest { limit: place.wish.filter.limit() },
-            }
-        };
-        cluster
-            .members()
-            .filter(|(slot, _)| !place.offers.contains_key(slot))
-            .map(|(slot, member)| (member.name.clone(), why(slot, member)))
-            .collect()
-    }
-}
-
-/// Why one node is not offered to one framework.
-#[derive(Debug, Clone, PartialEq)]
-pub enum NotOffered {
-    /// The framework has no session.
-    Disconnected,
-    /// It wants no offers.
-    Suppressed,
-    /// Its namespace has no quota left.
-    Quota,
-    /// It declined the node, or let an offer run out.
-    Declined {
-        /// How long that holds yet, if the node gains nothing.
-        left: Duration,
-    },
-    /// Others are closer.
-    NotAmongTheClosest {
-        /// How many are offered at once.
-        limit: usize,
-    },
-    /// The node does not fit.
-    Refusal(Refusal),
-}
-
-impl NotOffered {
-    /// The reason as one word, for programs.
-    #[must_use]
-    pub fn reason(&self) -> &'static str {
-        match self {
-            NotOffered::Disconnected => "Disconnected",
-            NotOffered::Suppressed => "Suppressed",
-            NotOffered::Quota => "QuotaExceeded",
-            NotOffered::Declined { .. } => "Declined",
-            NotOffered::NotAmongTheClosest { .. } => "NotAmongTheClosest",
-            NotOffered::Refusal(refusal) => refusal.reason(),
-        }
-    }
-}
-
-impl std::fmt::Display for NotOffered {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        match self {
-            NotOffered::Disconnected => f.write_str("the framework is not connected"),
-            NotOffered::Suppressed => {
-                f.write_str("the framework suppressed its offers; Revive brings them back")
-            }
-            NotOffered::Quota => f.write_str("the namespace has no quota left"),
-            NotOffered::Declined { left } => {
-                write!(
-                    f,
-                    "was declined; offered again in {:.0} s, or when it has more",
-                    left.as_secs_f64()
-                )
-            }
-            NotOffered::NotAmongTheClosest { limit } => {
-                write!(
-                    f,
-                    "is not among the {limit} that are offered at once; filter.most sets how many"
-                )
-            }
-            NotOffered::Refusal(refusal) => write!(f, "{refusal}"),
-        }
     }
 }
 

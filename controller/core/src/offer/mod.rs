@@ -9,6 +9,7 @@
 //! |---|---|
 //! | [`allocator`] | which nodes a framework may be offered, best first: Algorithm 1 behind a trait |
 //! | [`book`] | which offers are out, when they end, what is refused until when |
+//! | [`explain`] | why a framework is not offered a node |
 //! | [`settle`] | whether an Accept gets what it wants, and who goes first when several want the same |
 //!
 //! **Offers are optimistic.** Many frameworks may hold an offer of the same node; nothing is set aside for any of
@@ -20,6 +21,7 @@
 
 pub mod allocator;
 pub mod book;
+pub mod explain;
 pub mod settle;
 #[cfg(test)]
 mod tests;

@@ -15,7 +15,8 @@ use proptest::prelude::*;
 use serde_json::json;
 
 use super::allocator::{self, Closest};
-use super::book::{Book, NotOffered};
+use super::book::Book;
+use super::explain::NotOffered;
 use super::settle::{Denied, Launch, Order, Verdict};
 use super::{EXPIRE_AFTER, GATHER, Notice, OfferId, Rescinded, Seat, Wish};
 use crate::cluster::Cluster;
