@@ -83,7 +83,9 @@ fn brute_force(robots: &[Point3<f64>], at: Point3<f64>) -> Vec<Slot> {
 
 fn indexed(space: &Space, at: Point3<f64>) -> Vec<Slot> {
     let nearest = space.nearest("map", at, RADIUS).map(|f| f.slot);
-    nearest.filter(|slot| passes(*slot)).take(NEAREST).collect()
+    let mut slots = Vec::with_capacity(NEAREST);
+    slots.extend(nearest.filter(|slot| passes(*slot)).take(NEAREST));
+    slots
 }
 
 fn nearest(robots: usize, queries: usize) {

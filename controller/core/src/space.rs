@@ -7,23 +7,27 @@
 //! A query reads circles that double, and gives what each adds in order of distance: who asks for the nearest of a large
 //! radius pays for a small one. Cells are columns: height counts in distances (robots on several floors), not in the grid.
 
+use std::cmp::Ordering;
 use std::collections::HashMap;
 use std::hash::{BuildHasherDefault, Hasher};
 
 use nalgebra::Point3;
 
 /// Side of a cell, metres. Radii of work in a building are 5 to 50 m; smaller cells follow the circle more closely and
-/// make more rows to read. The benchmark `offers` is slower with 5 m and with 20 m.
-const CELL: f64 = 10.0;
+/// make more rows to read; with 8 m the benchmark `offers` is slower. A power of two, so that a cell's edges are exact.
+const CELL: f64 = 16.0;
 
 /// Cells along a tile's side.
-const SIDE: i64 = 8;
+const SIDE: usize = 8;
 
 /// Cells of a tile.
-const CELLS: usize = (SIDE * SIDE) as usize;
+const CELLS: usize = SIDE * SIDE;
 
 /// Radius of a query's first circle, metres.
 const FIRST: f64 = 25.0;
+
+/// Room for the robots of the first circle, so that a query allocates once.
+const READY: usize = 64;
 
 /// Rounding of a sum of coordinates, relative to them: a circle's bounds are widened by it, so that a robot whose distance
 /// rounds to the radius is inside. Coarser than `f64`'s own by four digits.
@@ -93,7 +97,7 @@ impl Tile {
 
     /// The robots of a row's cells `from..=to`.
     fn row(&self, row: usize, from: usize, to: usize) -> &[Entry] {
-        let first = row * SIDE as usize;
+        let first = row * SIDE;
         &self.robots[self.begin[first + from] as usize..self.begin[first + to + 1] as usize]
     }
 }
@@ -140,7 +144,9 @@ impl Grid {
 /// Number of the cell along one axis. Saturating: beyond 2^31 cells a position lands in the last one, and is still
 /// compared by its true distance.
 fn cell_of(coordinate: f64) -> i32 {
-    (coordinate / CELL).floor() as i32
+    let cells = coordinate / CELL;
+    let towards_zero = cells as i32;
+    towards_zero.saturating_sub(i32::from(cells < f64::from(towards_zero)))
 }
 
 fn tile_of(cell: i32) -> i32 {
@@ -175,6 +181,15 @@ pub struct Found {
     pub slot: Slot,
     /// Metres from the query's position.
     pub distance: f64,
+}
+
+impl Found {
+    /// The nearest, and of equals the smallest slot, is the last. The bits of numbers that are not negative are ordered
+    /// as they are.
+    fn farthest_first(&self, other: &Self) -> Ordering {
+        let (one, two) = (other.distance.to_bits(), self.distance.to_bits());
+        one.cmp(&two).then(other.slot.cmp(&self.slot))
+    }
 }
 
 impl Space {
@@ -221,7 +236,7 @@ impl Space {
     #[must_use]
     pub fn nearest(&self, map: &str, at: Point3<f64>, radius: f64) -> Nearest<'_> {
         let grid = self.maps.get(map).map(|number| &self.grids[*number]);
-        Nearest { grid, at, radius, seen: -1.0, found: 0, ready: Vec::new() }
+        Nearest { grid, at, radius, seen: -1.0, found: 0, ready: Vec::with_capacity(READY) }
     }
 }
 
@@ -244,29 +259,28 @@ impl Nearest<'_> {
     /// Reads the next circle.
     fn widen(&mut self, grid: &Grid) {
         let reach = if self.seen < 0.0 { FIRST } else { self.seen * 2.0 }.min(self.radius);
-        let circle = Circle::new(self.at, reach);
-        let window = circle.tiles();
-        let ([left, low], [right, high]) = window;
-        let area = (i64::from(right) - i64::from(left) + 1) * (i64::from(high) - i64::from(low) + 1);
+        let circle = Circle { at: self.at, reach, seen: self.seen };
+        let ([left, low], [right, high]) = circle.tiles();
+        let area =
+            (i64::from(right) - i64::from(left) + 1) * (i64::from(high) - i64::from(low) + 1);
         if area > grid.tiles.len() as i64 {
             // A circle wider than all robots together.
-            for (key, tile) in &grid.tiles {
-                if (left..=right).contains(&key.0) && (low..=high).contains(&key.1) {
-                    circle.read(*key, tile, self.seen, &mut self.ready);
+            for ((x, y), tile) in &grid.tiles {
+                if (left..=right).contains(x) && (low..=high).contains(y) {
+                    circle.read(tile, *x, &circle.rows(*y), &mut self.ready);
                 }
             }
         } else {
             for y in low..=high {
+                let rows = circle.rows(y);
                 for x in left..=right {
                     if let Some(tile) = grid.tiles.get(&(x, y)) {
-                        circle.read((x, y), tile, self.seen, &mut self.ready);
+                        circle.read(tile, x, &rows, &mut self.ready);
                     }
                 }
             }
         }
-        self.ready.sort_unstable_by(|a, b| {
-            b.distance.total_cmp(&a.distance).then(b.slot.cmp(&a.slot))
-        });
+        self.ready.sort_unstable_by(Found::farthest_first);
         self.seen = reach;
         self.found += self.ready.len();
         if reach >= self.radius || self.found == grid.robots {
@@ -289,61 +303,93 @@ impl Iterator for Nearest<'_> {
     }
 }
 
-/// What a query reads at once.
+/// What a query reads at once: the robots within `reach` metres and farther than `seen`.
 #[derive(Debug)]
 struct Circle {
     at: Point3<f64>,
     reach: f64,
-    /// `reach` squared and a little more: most robots outside are told by it, without a root.
-    almost: f64,
-    /// What rounding may add along x and y.
-    slack: [f64; 2],
+    seen: f64,
+}
+
+/// The cells of a tile's rows that a circle covers: from the first row on, the first and the last column of each, in the
+/// map's count of cells.
+#[derive(Debug)]
+struct Rows {
+    first: usize,
+    columns: [(i32, i32); SIDE],
+    end: usize,
 }
 
 impl Circle {
-    fn new(at: Point3<f64>, reach: f64) -> Self {
-        let slack = [at.x, at.y].map(|c| (c.abs() + reach) * SLACK);
-        Self { at, reach, almost: reach * reach * (1.0 + 4.0 * f64::EPSILON), slack }
+    /// What rounding may add to a sum of `coordinate` and the reach.
+    fn slack(&self, coordinate: f64) -> f64 {
+        (coordinate.abs() + self.reach) * SLACK
     }
 
     /// The cells between `centre - half` and `centre + half`.
-    fn cells(centre: f64, half: f64) -> (i32, i32) {
+    fn cells(&self, centre: f64, half: f64) -> (i32, i32) {
+        let half = half + self.slack(centre);
         (cell_of(centre - half), cell_of(centre + half))
     }
 
     /// The tiles of the square around it: lowest and highest column and row.
     fn tiles(&self) -> ([i32; 2], [i32; 2]) {
-        let (left, right) = Self::cells(self.at.x, self.reach + self.slack[0]);
-        let (low, high) = Self::cells(self.at.y, self.reach + self.slack[1]);
+        let ((left, right), (low, high)) =
+            (self.cells(self.at.x, self.reach), self.cells(self.at.y, self.reach));
         ([left, low].map(tile_of), [right, high].map(tile_of))
     }
 
-    /// Adds the robots of a tile that are in the circle and farther than `seen`.
-    fn read(&self, (column, row): Key, tile: &Tile, seen: f64, to: &mut Vec<Found>) {
-        // In i64: the last tile's end is beyond i32.
-        let (x0, y0) = (i64::from(column) * SIDE, i64::from(row) * SIDE);
-        let clip = |cell: i32, origin: i64| (i64::from(cell) - origin).clamp(0, SIDE - 1);
-        let (low, high) = Self::cells(self.at.y, self.reach + self.slack[1]);
-        for y in clip(low, y0)..=clip(high, y0) {
+    fn rows(&self, tile: i32) -> Rows {
+        let begin = cell_at(tile);
+        let (low, high) = self.cells(self.at.y, self.reach);
+        let (first, end) = (within(low, begin), within(high, begin) + 1);
+        let slack = self.slack(self.at.y);
+        let mut columns = [(0, 0); SIDE];
+        for (row, columns) in columns.iter_mut().enumerate().take(end).skip(first) {
             // How far the circle reaches along x at this row's edge that is nearest to the centre.
-            let bottom = (y0 + y) as f64 * CELL;
-            let off = (bottom - self.at.y).max(self.at.y - (bottom + CELL)).max(0.0);
+            let bottom = (begin + row as i64) as f64 * CELL;
+            let off = (bottom - self.at.y).max(self.at.y - (bottom + CELL)) - slack;
+            let off = off.max(0.0);
             // A row beyond the circle: the last one holds everything that is farther out.
-            let half = if off < self.reach { (self.almost - off * off).sqrt() } else { self.reach };
-            let (left, right) = Self::cells(self.at.x, half + self.slack[0]);
-            let (left, right) = (clip(left, x0) as usize, clip(right, x0) as usize);
-            for (slot, position) in tile.row(y as usize, left, right) {
+            let half = if off < self.reach {
+                (self.reach * self.reach - off * off).sqrt()
+            } else {
+                self.reach
+            };
+            *columns = self.cells(self.at.x, half);
+        }
+        Rows { first, columns, end }
+    }
+
+    /// Adds a tile's robots that are in the circle.
+    fn read(&self, tile: &Tile, column: i32, rows: &Rows, to: &mut Vec<Found>) {
+        let begin = cell_at(column);
+        // Most robots outside are told without a root.
+        let almost = self.reach * self.reach * (1.0 + 4.0 * f64::EPSILON);
+        for row in rows.first..rows.end {
+            let (left, right) = rows.columns[row];
+            for (slot, position) in tile.row(row, within(left, begin), within(right, begin)) {
                 let squared = nalgebra::distance_squared(&self.at, position);
-                if squared > self.almost {
+                if squared > almost {
                     continue;
                 }
                 let distance = squared.sqrt();
-                if distance <= self.reach && distance > seen {
+                if distance <= self.reach && distance > self.seen {
                     to.push(Found { slot: *slot, distance });
                 }
             }
         }
     }
+}
+
+/// The first cell of a tile along one axis. Wider than a cell's number: the last tile ends beyond it.
+fn cell_at(tile: i32) -> i64 {
+    i64::from(tile) * SIDE as i64
+}
+
+/// The place of a cell in the tile that begins at `begin`, or of the tile's cell that is nearest to it.
+fn within(cell: i32, begin: i64) -> usize {
+    (i64::from(cell) - begin).clamp(0, SIDE as i64 - 1) as usize
 }
 
 #[cfg(test)]
