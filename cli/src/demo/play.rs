@@ -16,7 +16,7 @@ use super::check::{self, Seen};
 use super::figures::{Held, Report, Row, percent, totals};
 use super::house::House;
 use super::measure::{Found, Measured, lines, measure};
-use super::print::Out;
+use super::print::{BUSY, Out};
 use super::scenario::{self, NODES, ROBOT, WORKLOADS};
 use super::{Args, DemoError, verdict};
 use crate::error::CliError;
@@ -25,6 +25,8 @@ use crate::error::CliError;
 const LIMIT: Duration = Duration::from_secs(30);
 /// After its calibration a workload's rate still settles for a few of its windows of a second.
 const SETTLE: Duration = Duration::from_secs(3);
+/// How often at most something is measured while others use the machine; the measurement that they disturbed least counts.
+const MEASUREMENTS: usize = 3;
 /// No robot has more cores than this many users of a camera need.
 const MOST_USERS: usize = 8;
 
@@ -250,15 +252,34 @@ impl Play<'_, '_> {
             .collect();
         self.out.doing(&format!("{what}: settling"));
         tokio::time::sleep(SETTLE).await;
+        let mut best = self.measure_once(&ids, what, window).await?;
+        for _ in 1..MEASUREMENTS {
+            if best.others <= BUSY {
+                break;
+            }
+            self.out.disturbed(what, best.others)?;
+            let again = self.measure_once(&ids, what, window).await?;
+            if again.others < best.others {
+                best = again;
+            }
+        }
+        self.others = self.others.max(best.others);
+        Ok(best)
+    }
+
+    async fn measure_once(
+        &mut self,
+        ids: &[(String, String)],
+        what: &str,
+        window: Duration,
+    ) -> Result<Found, CliError> {
         let (out, robot) = (&mut *self.out, self.robot_millis);
         let seconds = window.as_secs();
-        let found = measure(&self.api, &ids, window, |shares| {
+        measure(&self.api, ids, window, |shares| {
             let sum: f64 = shares.values().sum();
             out.doing(&format!("{what}: measuring {seconds} s, {:.1} %", percent(sum, robot)));
         })
-        .await?;
-        self.others = self.others.max(found.others);
-        Ok(found)
+        .await
     }
 
     /// Puts what was measured into the rows.

@@ -25,7 +25,7 @@ const WHY_LESS: &str = "Loads that add up give 3.00 over the mean: three workloa
 and its workloads take what cpu they get. Here each has a frame clock and does the same work as alone.";
 
 /// Cores that others may use without a word: the daemons and a desktop.
-const BUSY: f64 = 0.4;
+pub(super) const BUSY: f64 = 0.4;
 
 /// Where everything is printed.
 pub(super) struct Out<'a> {
@@ -114,6 +114,13 @@ impl<'a> Out<'a> {
         let rate = number(measured.throughput, 1, "/s");
         let p99 = number(measured.p99_ms, 0, " ms");
         self.say(&format!("  {when:>5}  {task:<13} cpu {cpu:>7}  work {rate:>9}  p99 {p99:>7}"))
+    }
+
+    /// Others used this many cores during a measurement, which is made again.
+    pub(super) fn disturbed(&mut self, what: &str, others: f64) -> Result<(), CliError> {
+        let said =
+            format!("  {what}: other processes used {others:.1} cores meanwhile; measuring again");
+        self.say(&self.ui.styles.warn.paint(said).to_string())
     }
 
     /// The result.
