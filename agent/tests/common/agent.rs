@@ -63,13 +63,25 @@ impl Agent {
     }
 
     pub fn spawn(&mut self) {
-        let mut command = command(self.dir.path(), &self.args);
-        if self.nobody {
+        let mut command = if self.nobody {
             use std::os::unix::process::CommandExt;
+            let mut command = command_of(&self.own_program(), self.dir.path(), &self.args);
             command.uid(NOBODY).gid(NOBODY);
-        }
+            command
+        } else {
+            command(self.dir.path(), &self.args)
+        };
         let child = command.spawn().unwrap();
         self.child = Some(child);
+    }
+
+    /// A copy of the program that everybody may run: the build may be in a home that is closed to others.
+    fn own_program(&self) -> PathBuf {
+        let program = self.dir.path().join("program");
+        if !program.exists() {
+            std::fs::copy(env!("CARGO_BIN_EXE_muster-agent"), &program).unwrap();
+        }
+        program
     }
 
     pub fn pid(&self) -> i32 {
@@ -131,7 +143,11 @@ impl Agent {
 }
 
 pub fn command(data_dir: &Path, args: &[String]) -> Command {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_muster-agent"));
+    command_of(Path::new(env!("CARGO_BIN_EXE_muster-agent")), data_dir, args)
+}
+
+fn command_of(program: &Path, data_dir: &Path, args: &[String]) -> Command {
+    let mut command = Command::new(program);
     command.args(args).arg("--data-dir").arg(data_dir);
     command.env("RUST_LOG", "muster_agent=debug,info").stdin(Stdio::null());
     command
