@@ -352,9 +352,7 @@ impl Drop for Cluster {
                 .is_ok_and(|e| String::from_utf8_lossy(&e).contains(&dir))
         });
         for pid in kernel::with_command(&dir).into_iter().chain(in_environment) {
-            drop(
-                Command::new("kill").args(["-9", &pid.to_string()]).stderr(Stdio::null()).status(),
-            );
+            kernel::kill(pid);
         }
         if std::thread::panicking() {
             for name in ["controller"].into_iter().chain(self.agents.keys().map(String::as_str)) {

@@ -45,6 +45,14 @@ pub fn freeze(pid: u32, frozen: bool) {
     kill_process(pid, signal).expect("it is there");
 }
 
+/// Ends a process at once (SIGKILL); one that is gone already is no fault.
+pub fn kill(pid: u32) {
+    use rustix::process::{Pid, Signal, kill_process};
+    if let Some(pid) = i32::try_from(pid).ok().and_then(Pid::from_raw) {
+        drop(kill_process(pid, Signal::KILL));
+    }
+}
+
 /// When a live process started; none for one that is gone or a zombie.
 #[must_use]
 pub fn start_time(pid: u32) -> Option<u64> {

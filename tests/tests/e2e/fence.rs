@@ -1,6 +1,5 @@
 //! A robot that is lost: what a person's word frees, and what holds when the person erred.
 
-use std::process::Command;
 
 use muster_api::condition;
 use muster_api::phase::TaskPhase;
@@ -63,10 +62,7 @@ async fn a_robot_that_is_off_is_fenced_and_goes_on_with_the_next_driver() {
     // Without power its shims and tasks are gone as well.
     let data = cluster.dir().join("robot").display().to_string();
     let tasks = kernel::with_env("MUSTER_UID", &first).into_iter().map(|process| process.pid);
-    let pids = kernel::with_command(&data).into_iter().chain(tasks);
-    let pids: Vec<String> = pids.map(|pid| pid.to_string()).collect();
-    // One of them may end because another one did.
-    Command::new("kill").arg("-9").args(&pids).status().expect("kill starts");
+    kernel::with_command(&data).into_iter().chain(tasks).for_each(kernel::kill);
     wait::until("without power", || {
         let left = kernel::with_env("MUSTER_UID", &first);
         async move { if left.is_empty() { Ok(()) } else { Err(format!("{left:?}")) } }

@@ -27,8 +27,8 @@ fn task(run: Value) -> Value {
     })
 }
 
-/// Cores that a running task gets, from the kernel's account of its cgroup.
-async fn share(cluster: &Cluster, name: &str) -> f64 {
+/// A running task's group, warm: some periods of its quota have passed, so that the burst at the start does not count.
+async fn warm(cluster: &Cluster, name: &str) -> u32 {
     let task = cluster.phase(name, TaskPhase::Running).await;
     let uid = task.metadata.uid.expect("set by the server");
     let pid = wait::until("visible in /proc", || async {
@@ -38,30 +38,43 @@ async fn share(cluster: &Cluster, name: &str) -> f64 {
             .ok_or_else(|| "no process".to_owned())
     })
     .await;
-    let read = || kernel::cgroup_cpu_time(pid).expect("a task is in a cgroup");
-    // Let some periods of the quota pass, so that the burst at the start does not count.
-    let begin = read();
+    let begin = cpu_time(pid);
     wait::until("warm", || async move {
-        if read() > begin + Duration::from_millis(200) {
+        if cpu_time(pid) > begin + Duration::from_millis(200) {
             Ok(())
         } else {
             Err("starting".to_owned())
         }
     })
     .await;
-    let (cpu, wall) = (read(), Instant::now());
+    pid
+}
+
+fn cpu_time(pid: u32) -> Duration {
+    kernel::cgroup_cpu_time(pid).expect("a task is in a cgroup")
+}
+
+/// Cores that a task's group gets in some seconds, from the kernel's account of it.
+async fn share(pid: u32) -> f64 {
+    let (cpu, wall) = (cpu_time(pid), Instant::now());
     wait::until("measured", || async move {
         if wall.elapsed() > Duration::from_secs(4) { Ok(()) } else { Err("measuring".to_owned()) }
     })
     .await;
-    (read() - cpu).as_secs_f64() / wall.elapsed().as_secs_f64()
+    (cpu_time(pid) - cpu).as_secs_f64() / wall.elapsed().as_secs_f64()
 }
 
+/// Never more than its quota; and all of it, unless others leave it less of a busy machine: then it is measured again.
 async fn gets_half_a_core(run: Value) {
     let cluster = cloud().await;
     cluster.create("spin", task(run)).await;
-    let share = share(&cluster, "spin").await;
-    assert!((share - 0.5).abs() <= 0.03, "{share:.3} cores instead of 0.500");
+    let pid = warm(&cluster, "spin").await;
+    wait::until("a share of 0.500 cores", || async move {
+        let share = share(pid).await;
+        assert!(share <= 0.53, "{share:.3} cores are more than 0.500");
+        if share >= 0.47 { Ok(()) } else { Err(format!("{share:.3} cores")) }
+    })
+    .await;
     cluster.delete("spin").await;
 }
 
