@@ -49,7 +49,7 @@ pub fn freeze(pid: u32, frozen: bool) {
 pub fn kill(pid: u32) {
     use rustix::process::{Pid, Signal, kill_process};
     if let Some(pid) = i32::try_from(pid).ok().and_then(Pid::from_raw) {
-        drop(kill_process(pid, Signal::KILL));
+        let _ = kill_process(pid, Signal::KILL);
     }
 }
 

@@ -44,6 +44,8 @@ struct Plan {
     #[serde(default)]
     waits: Vec<Wait>,
     #[serde(default)]
+    preemptions: Vec<Preemption>,
+    #[serde(default)]
     revision: String,
 }
 
@@ -90,6 +92,14 @@ struct Placement {
 struct PlannedLease {
     group: String,
     epoch: Epoch,
+}
+
+#[derive(Debug, Deserialize)]
+struct Preemption {
+    namespace: String,
+    name: String,
+    node: String,
+    victims: Vec<String>,
 }
 
 #[derive(Debug, Deserialize)]
@@ -165,6 +175,11 @@ fn render(plan: &Plan, styles: &Styles) -> String {
         text.push('\n');
         for field in &change.fields {
             text.push_str(&format!("    {}\n", describe(field)));
+        }
+        let mut rooms = plan.preemptions.iter();
+        if let Some(room) = rooms.find(|p| is_it(&p.namespace, &p.name) && !p.victims.is_empty()) {
+            let line = format!("would end on {}: {}", room.node, room.victims.join(", "));
+            text.push_str(&format!("    {}\n", styles.bad.paint(line)));
         }
         if let Some(wait) = plan.waits.iter().find(|w| is_it(&w.namespace, &w.name)) {
             text.push_str(&format!("    {}\n", styles.warn.paint("would wait:")));

@@ -17,7 +17,7 @@ use muster_api::pose::Pose;
 use muster_api::quantity::{Bytes, MilliCpu};
 use muster_api::selector::Labels;
 
-use crate::ledger::{Denied, NodeLedger, Reservation};
+use crate::ledger::{Denied, NodeLedger, Reservation, Standing};
 use crate::recent::Recent;
 use crate::space::{Slot, Space};
 
@@ -131,6 +131,10 @@ pub struct Cluster {
     members: Vec<Member>,
     slots: HashMap<NodeName, Slot>,
     placed: HashMap<TaskUid, Slot>,
+    /// Tasks for which room is made.
+    nominated: HashMap<TaskUid, Slot>,
+    /// How many tasks of each priority hold something.
+    priorities: BTreeMap<i32, usize>,
     space: Space,
     by_free: BTreeSet<FreeKey>,
     quotas: BTreeMap<Arc<str>, QuotaSpec>,
@@ -212,12 +216,68 @@ impl Cluster {
     /// Books a task that the store says is placed.
     pub fn book(&mut self, uid: &TaskUid, node: &NodeName, reservation: Reservation) {
         let slot = self.slot(node);
+        self.unnominate(uid);
         self.placed.insert(uid.clone(), slot);
         let ledger = &mut self.members[slot as usize].ledger;
-        if ledger.reservation(uid).is_none() {
-            ledger.book(uid, reservation);
+        match ledger.reservation(uid) {
+            None => {
+                *self.priorities.entry(reservation.standing.priority).or_default() += 1;
+                ledger.book(uid, reservation);
+                self.touch(slot);
+            }
+            Some(present) if present.standing != reservation.standing => {
+                self.set_standing(uid, reservation.standing);
+            }
+            Some(_) => {}
+        }
+    }
+
+    /// A task that holds something stands otherwise than before.
+    pub(crate) fn set_standing(&mut self, uid: &TaskUid, standing: Standing) {
+        let Some(&slot) = self.placed.get(uid) else { return };
+        let ledger = &mut self.members[slot as usize].ledger;
+        let Some(present) = ledger.reservation(uid) else { return };
+        let before = present.standing.priority;
+        uncount(&mut self.priorities, before);
+        *self.priorities.entry(standing.priority).or_default() += 1;
+        ledger.set_standing(uid, standing);
+    }
+
+    /// A task that holds something is being ended, or is not after all.
+    pub fn set_stopping(&mut self, uid: &TaskUid, stopping: bool) {
+        let reservation = self.node_of(uid).and_then(|m| m.ledger.reservation(uid));
+        if let Some(standing) = reservation.map(|r| r.standing.clone()) {
+            self.set_standing(uid, Standing { stopping, ..standing });
+        }
+    }
+
+    /// The least priority of all tasks that hold something.
+    #[must_use]
+    pub(crate) fn least_priority(&self) -> Option<i32> {
+        self.priorities.first_key_value().map(|(priority, _)| *priority)
+    }
+
+    /// Keeps room on a node for a task, while others are ended to make it.
+    pub fn nominate(&mut self, uid: &TaskUid, node: &NodeName, reservation: &Reservation) {
+        self.unnominate(uid);
+        let slot = self.slot(node);
+        self.members[slot as usize].ledger.keep(uid, reservation);
+        self.nominated.insert(uid.clone(), slot);
+        self.touch(slot);
+    }
+
+    /// No room is kept for the task any more.
+    pub fn unnominate(&mut self, uid: &TaskUid) {
+        let Some(slot) = self.nominated.remove(uid) else { return };
+        if self.members[slot as usize].ledger.unkeep(uid) {
             self.touch(slot);
         }
+    }
+
+    /// The node on which room is kept for a task.
+    #[must_use]
+    pub fn nomination(&self, uid: &TaskUid) -> Option<Slot> {
+        self.nominated.get(uid).copied()
     }
 
     /// Reserves for a task by a decision of ours.
@@ -231,7 +291,10 @@ impl Cluster {
         slot: Slot,
         reservation: Reservation,
     ) -> Result<(), Denied> {
+        let priority = reservation.standing.priority;
         self.members[slot as usize].ledger.reserve(uid, reservation)?;
+        *self.priorities.entry(priority).or_default() += 1;
+        self.unnominate(uid);
         self.placed.insert(uid.clone(), slot);
         self.touch(slot);
         Ok(())
@@ -241,6 +304,9 @@ impl Cluster {
     pub fn undo(&mut self, uid: &TaskUid) {
         let Some(slot) = self.placed.remove(uid) else { return };
         let member = &mut self.members[slot as usize];
+        if let Some(reservation) = member.ledger.reservation(uid) {
+            uncount(&mut self.priorities, reservation.standing.priority);
+        }
         member.ledger.undo(uid);
         member.version -= 1;
         self.reorder(slot);
@@ -267,6 +333,9 @@ impl Cluster {
     pub fn release(&mut self, uid: &TaskUid) -> Option<NodeName> {
         let slot = self.placed.remove(uid)?;
         let member = &mut self.members[slot as usize];
+        if let Some(reservation) = member.ledger.reservation(uid) {
+            uncount(&mut self.priorities, reservation.standing.priority);
+        }
         member.ledger.release(uid);
         let name = member.name.clone();
         self.touch(slot);
@@ -367,5 +436,14 @@ impl Cluster {
     #[must_use]
     pub fn space(&self) -> &Space {
         &self.space
+    }
+}
+
+fn uncount(priorities: &mut BTreeMap<i32, usize>, priority: i32) {
+    if let Some(count) = priorities.get_mut(&priority) {
+        *count -= 1;
+        if *count == 0 {
+            priorities.remove(&priority);
+        }
     }
 }

@@ -24,6 +24,28 @@ pub struct Reservation {
     pub compute: Compute,
     /// Conflict groups of actuators.
     pub groups: Vec<String>,
+    /// How it stands against tasks that find no room.
+    pub standing: Standing,
+}
+
+/// What preemption asks of who holds something.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Standing {
+    /// Tasks of more priority may take its place.
+    pub priority: i32,
+    /// It is being ended already.
+    pub stopping: bool,
+    /// Of work for an executor: the executor's `namespace/name`. The work ends with it.
+    pub executor: Option<Arc<str>>,
+}
+
+/// What is kept for a task while others are ended to make room for it.
+#[derive(Debug, Clone, PartialEq, Eq)]
+struct Kept {
+    title: Arc<str>,
+    priority: i32,
+    compute: Compute,
+    groups: Vec<String>,
 }
 
 /// A conflict group of a robot's actuators.
@@ -47,6 +69,11 @@ pub enum Denied {
         /// Who holds it.
         holder: TaskUid,
     },
+    /// It would fit, but for what is kept for a task of as much priority or more.
+    Kept {
+        /// For whom, `namespace/name`.
+        title: Arc<str>,
+    },
 }
 
 /// The books of one node.
@@ -55,7 +82,11 @@ pub struct NodeLedger {
     allocatable: Compute,
     used: Compute,
     reservations: BTreeMap<TaskUid, Reservation>,
+    /// The order in which reservations came: the youngest is the last.
+    came: BTreeMap<TaskUid, u64>,
+    next: u64,
     groups: BTreeMap<String, Group>,
+    kept: BTreeMap<TaskUid, Kept>,
 }
 
 impl NodeLedger {
@@ -106,6 +137,84 @@ impl NodeLedger {
     /// Every reservation.
     pub fn reservations(&self) -> impl Iterator<Item = (&TaskUid, &Reservation)> {
         self.reservations.iter()
+    }
+
+    /// Number of a reservation in the order in which they came here.
+    #[must_use]
+    pub fn came(&self, uid: &TaskUid) -> u64 {
+        self.came.get(uid).copied().unwrap_or(0)
+    }
+
+    /// How a reservation stands now.
+    pub fn set_standing(&mut self, uid: &TaskUid, standing: Standing) {
+        if let Some(reservation) = self.reservations.get_mut(uid) {
+            reservation.standing = standing;
+        }
+    }
+
+    /// Keeps room for `uid` from tasks of no more priority.
+    pub(crate) fn keep(&mut self, uid: &TaskUid, reservation: &Reservation) {
+        let kept = Kept {
+            title: Arc::clone(&reservation.title),
+            priority: reservation.standing.priority,
+            compute: reservation.compute.clone(),
+            groups: reservation.groups.clone(),
+        };
+        self.kept.insert(uid.clone(), kept);
+    }
+
+    /// Nothing is kept for `uid` any more. Says whether there was anything.
+    pub(crate) fn unkeep(&mut self, uid: &TaskUid) -> bool {
+        self.kept.remove(uid).is_some()
+    }
+
+    /// What is kept from a task of this priority, for others.
+    pub(crate) fn kept_from(&self, uid: &TaskUid, priority: i32) -> Compute {
+        let mut sum = Compute::default();
+        for (_, kept) in self.kept.iter().filter(|(u, k)| *u != uid && k.priority >= priority) {
+            sum.add(&kept.compute);
+        }
+        sum
+    }
+
+    /// For whom a group is kept from a task of this priority.
+    pub(crate) fn group_kept_from(
+        &self,
+        uid: &TaskUid,
+        priority: i32,
+        groups: &[String],
+    ) -> Option<Arc<str>> {
+        let mut others = self.kept.iter().filter(|(u, k)| *u != uid && k.priority >= priority);
+        others
+            .find(|(_, k)| k.groups.iter().any(|g| groups.contains(g)))
+            .map(|(_, k)| Arc::clone(&k.title))
+    }
+
+    /// Whether a reservation would be granted to this task, which may be one that room is kept from.
+    ///
+    /// # Errors
+    ///
+    /// What stands against it.
+    pub fn check_for(
+        &self,
+        (uid, priority): (&TaskUid, i32),
+        compute: &Compute,
+        groups: &[String],
+    ) -> Result<(), Denied> {
+        self.check(compute, groups)?;
+        if self.kept.is_empty() {
+            return Ok(());
+        }
+        if let Some(title) = self.group_kept_from(uid, priority, groups) {
+            return Err(Denied::Kept { title });
+        }
+        let mut free = self.free();
+        free.saturating_sub(&self.kept_from(uid, priority));
+        let mut others = self.kept.iter().filter(|(u, k)| *u != uid && k.priority >= priority);
+        match (free.shortage_for(compute), others.next()) {
+            (Some(_), Some((_, kept))) => Err(Denied::Kept { title: Arc::clone(&kept.title) }),
+            _ => Ok(()),
+        }
     }
 
     /// The state of a conflict group; never granted: epoch 0.
@@ -163,6 +272,9 @@ impl NodeLedger {
         }
         self.used.add(&reservation.compute);
         self.reservations.insert(uid.clone(), reservation);
+        self.came.insert(uid.clone(), self.next);
+        self.next += 1;
+        self.kept.remove(uid);
     }
 
     /// Sets what the store says of a group. An epoch never goes back.
@@ -187,6 +299,7 @@ impl NodeLedger {
         for group in self.groups.values_mut().filter(|g| g.holder.as_ref() == Some(uid)) {
             group.holder = None;
         }
+        self.came.remove(uid);
         let Some(reservation) = self.reservations.remove(uid) else {
             return false;
         };
@@ -206,6 +319,7 @@ mod tests {
             title: "default/t".into(),
             compute: Compute::new(MilliCpu(cpu), Bytes(0)),
             groups: groups.iter().map(|g| (*g).to_owned()).collect(),
+            standing: Standing::default(),
         }
     }
 

@@ -4,7 +4,7 @@
 //! same code runs in production, in `muster plan`, in `muster why` and in simulation.
 //!
 //! ```text
-//!   store events ──▶ Cluster (nodes, ledger, space) ──schedule()──▶ Plan { binds, waits }
+//!   store events ──▶ Cluster (nodes, ledger, space) ──schedule()──▶ Plan { binds, waits, preemptions }
 //!   heartbeats  ──▶ NodeHealth ──tick()──▶ who was lost, who is back
 //! ```
 //!
@@ -14,6 +14,7 @@
 //! | [`space`] | which robots are nearest, without a scan |
 //! | [`cluster`] | the nodes with their ledgers, and the orders in which they are tried |
 //! | [`schedule`] | where a task goes, or why it goes nowhere (invariant 6) |
+//! | [`preempt`] | who is ended to make room for whom |
 //! | [`offer`] | which frameworks are shown what, and whose Accept passes |
 //! | [`fairness`] | namespaces' shares and quotas |
 //! | [`recent`] | one allocation for what many nodes or tasks have in common |
@@ -29,6 +30,7 @@ mod fixtures;
 pub mod ledger;
 pub mod node_health;
 pub mod offer;
+pub mod preempt;
 pub mod recent;
 pub mod report;
 pub mod schedule;

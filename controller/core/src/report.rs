@@ -101,6 +101,11 @@ pub enum Refusal {
         /// `namespace/name` of the holder.
         holder: String,
     },
+    /// It would fit, but others are being ended there to make room for a task that is more important, or came first.
+    Kept {
+        /// For whom, `namespace/name`.
+        title: String,
+    },
 }
 
 impl Refusal {
@@ -126,6 +131,7 @@ impl Refusal {
             Refusal::NoSpeed => "NoSpeed",
             Refusal::Exhausted { .. } => "Exhausted",
             Refusal::LeaseHeld { .. } => "LeaseHeld",
+            Refusal::Kept { .. } => "KeptForAnother",
         }
     }
 
@@ -217,6 +223,9 @@ impl fmt::Display for Refusal {
                     f,
                     "actuators ({group}) are held by {holder}; waits until its processes are gone"
                 )
+            }
+            Refusal::Kept { title } => {
+                write!(f, "what is left is kept for {title}, for which others are being ended")
             }
         }
     }

@@ -3,7 +3,8 @@
 //!
 //! | loop | looks at | does |
 //! |---|---|---|
-//! | [`schedule`] | Nodes, Tasks, Leases | binds Pending tasks, or writes why not |
+//! | [`schedule`] | Nodes, Tasks, Leases | binds Pending tasks, orders ends to make room, or writes why not |
+//! | [`deadline`] | Tasks with deadlines | orders the end of those that have run long enough, removes those that ended long ago |
 //! | [`desk`] | frameworks, in [`schedule`]'s own task | shows offers, takes Accepts |
 //! | [`failover`] | Frameworks | removes those that stay away, writes their numbers |
 //! | [`books`] | the scheduler's ledger | writes used, free and leases into Node status |
@@ -14,12 +15,14 @@
 
 mod bind;
 pub mod books;
+pub mod deadline;
 pub mod deletion;
 pub mod desk;
 pub mod failover;
 pub mod garbage;
 pub mod health;
 pub mod history;
+mod preempt;
 pub mod schedule;
 
 use std::sync::Arc;
@@ -60,6 +63,7 @@ pub fn spawn(context: &Arc<Context>, sessions: &Arc<Sessions>, tasks: &TaskTrack
     run("schedule", Box::pin(scheduler.run()));
     run("books", Box::pin(books::run(Arc::clone(context), books)));
     run("health", Box::pin(health::run(Arc::clone(context), Arc::clone(sessions))));
+    run("deadline", Box::pin(deadline::run(Arc::clone(context))));
     run("deletion", Box::pin(deletion::run(Arc::clone(context))));
     run("garbage", Box::pin(garbage::run(Arc::clone(context))));
     run("history", Box::pin(history::run(Arc::clone(context))));

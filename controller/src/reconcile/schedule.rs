@@ -19,13 +19,14 @@ use muster_api::id::TaskUid;
 use muster_api::kind::lease::Lease;
 use muster_api::kind::node::Node;
 use muster_api::kind::quota::Quota;
-use muster_api::kind::task::{NodeRefusal, Task, TaskSpec, TaskStatus};
+use muster_api::kind::task::{NodeRefusal, PREEMPTING, Task, TaskSpec, TaskStatus};
 use muster_api::name::NodeName;
 use muster_api::phase::TaskPhase;
 use muster_api::pose::Pose;
 use muster_controller_core::cluster::Cluster;
 use muster_controller_core::fairness::Accounts;
 use muster_controller_core::ledger::Reservation;
+use muster_controller_core::preempt::Preemption;
 use muster_controller_core::recent::Recent;
 use muster_controller_core::schedule::{self, Bind, Demand, Wait};
 use tokio::sync::{mpsc, oneshot};
@@ -34,7 +35,7 @@ use tokio_util::task::AbortOnDropHandle;
 
 use super::books::{Books, Page};
 use super::desk::{self, Desk};
-use super::{RETRY, bind, next_events, watch_from_now};
+use super::{RETRY, bind, next_events, preempt, watch_from_now};
 use crate::context::Context;
 use crate::objects::{self, LEASES, NODES, QUOTAS, TASKS};
 use crate::store::{Change, Event, Op, StoreError, Stored, Watcher};
@@ -194,10 +195,19 @@ impl Scheduler {
         self.desk.begin_anew();
         self.waiting.clear();
         self.own.clear();
-        for resource in [QUOTAS, NODES, LEASES, TASKS] {
+        for resource in [QUOTAS, NODES, LEASES] {
             for stored in self.context.store.list(resource, None).items {
                 self.take_in(resource, Change::Put, &stored);
             }
+        }
+        let mut tasks = self.context.store.list(TASKS, None).items;
+        // The ledger knows who came last by the order in which it hears of them.
+        tasks.sort_by_cached_key(|stored| {
+            let task = stored.mentions("boundAt").then(|| objects::read::<Task>(stored)).flatten();
+            task.and_then(|t| t.status).and_then(|s| s.bound_at).map(|at| at.0)
+        });
+        for stored in tasks {
+            self.take_in(TASKS, Change::Put, &stored);
         }
         tracing::info!(
             nodes = self.cluster.members().count(),
@@ -289,6 +299,7 @@ impl Scheduler {
                     spec: self.specs.share(task.spec),
                     since,
                 };
+                self.take_in_nomination(&demand, status.nominated_node);
                 let written_at = Instant::now();
                 self.waiting.insert(
                     uid,
@@ -306,11 +317,15 @@ impl Scheduler {
                 let title =
                     format!("{}/{}", stored.key.namespace().unwrap_or_default(), stored.key.name);
                 let compute = task.spec.resources.reserved();
+                let stopping = phase == TaskPhase::Stopping
+                    || status.stop.is_some()
+                    || task.metadata.deletion_timestamp.is_some();
+                let standing = schedule::standing(&title, &task.spec, stopping);
                 // Which groups it holds is said by the Lease objects.
                 self.cluster.book(
                     &uid,
                     &node,
-                    Reservation { title: title.into(), compute, groups: Vec::new() },
+                    Reservation { title: title.into(), compute, groups: Vec::new(), standing },
                 );
                 self.dirty.insert(node);
             }
@@ -318,7 +333,20 @@ impl Scheduler {
         }
     }
 
+    /// Room that was being made before the cluster was made anew is kept on.
+    fn take_in_nomination(&mut self, demand: &Demand, node: Option<String>) {
+        let Some(node) = node.and_then(|n| NodeName::new(n).ok()) else { return };
+        if self.cluster.nomination(&demand.uid).is_some() {
+            return;
+        }
+        let facts = self.cluster.member(&node).and_then(|m| m.facts.as_ref());
+        if let Some(reservation) = facts.map(|facts| demand.reservation(facts)) {
+            self.cluster.nominate(&demand.uid, &node, &reservation);
+        }
+    }
+
     fn forget(&mut self, uid: &TaskUid) {
+        self.cluster.unnominate(uid);
         self.waiting.remove(uid);
         self.dirty.extend(self.cluster.release(uid));
     }
@@ -349,8 +377,9 @@ impl Scheduler {
                 self.waiting.values().map(|w| w.demand.clone()).collect();
             let plan = schedule::schedule(&mut self.cluster, &mut demands);
             let binds = self.bind_all(plan.binds).await;
+            let preempted = self.preempt_all(plan.preemptions).await;
             let waits = self.write_reasons(plan.waits).await;
-            retry = [binds, waits].into_iter().flatten().min();
+            retry = [binds, preempted, waits].into_iter().flatten().min();
         }
         let desk = self.desk.work(&mut self.cluster).await;
         let retry = [retry, desk].into_iter().flatten().min();
@@ -391,6 +420,35 @@ impl Scheduler {
                 }
             }
             self.dirty.insert(bind.node);
+        }
+        retry
+    }
+
+    /// Orders the ends of those that make room, each order with its reason in one transaction with the nomination.
+    async fn preempt_all(&mut self, preemptions: Vec<Preemption>) -> Option<Instant> {
+        let mut retry = None;
+        for preemption in preemptions {
+            let Some(waiting) = self.waiting.get_mut(&preemption.uid) else { continue };
+            let title = Arc::clone(&waiting.demand.title);
+            match preempt::order(&self.context, &waiting.stored, &title, &preemption).await {
+                Ok(Some(stored)) => {
+                    self.own.insert(stored.revision);
+                    waiting.stored = stored;
+                }
+                // Nothing new is to be ordered.
+                Ok(None) => {}
+                Err(error) => {
+                    // What was marked as ending is not: the next pass decides anew by what the store says.
+                    for victim in &preemption.victims {
+                        self.cluster.set_stopping(&victim.uid, false);
+                    }
+                    self.cluster.unnominate(&preemption.uid);
+                    if !objects::is_race(&error) {
+                        tracing::warn!(task = %preemption.uid, error = crate::app::chain(&error), "a preemption is not written");
+                    }
+                    retry = Some(Instant::now() + RETRY);
+                }
+            }
         }
         retry
     }
@@ -456,12 +514,7 @@ impl Scheduler {
         let store = &self.context.store;
         let written = join_all(due.into_iter().map(|(stored, uid, why)| async move {
             // As in a bind: a task that waits has nothing else in its status.
-            let status = TaskStatus {
-                reason: "Unschedulable".to_owned(),
-                message: headline(&why),
-                why: why.to_vec(),
-                ..TaskStatus::default()
-            };
+            let status = waiting_status(&why);
             (store.apply_one(Op::status(&stored, &status)).await, uid, why)
         }))
         .await;
@@ -483,6 +536,18 @@ impl Scheduler {
         if let Some(waiting) = self.waiting.get_mut(uid) {
             (waiting.stored, waiting.written, waiting.written_at) = (stored, why, Instant::now());
         }
+    }
+}
+
+/// The status of a task that waits for these reasons.
+fn waiting_status(why: &[NodeRefusal]) -> TaskStatus {
+    let preempting = why.iter().find(|w| w.reason == PREEMPTING);
+    TaskStatus {
+        reason: preempting.map_or("Unschedulable", |_| PREEMPTING).to_owned(),
+        message: preempting.map_or_else(|| headline(why), |w| format!("{}: {}", w.node, w.message)),
+        nominated_node: preempting.map(|w| w.node.clone()),
+        why: why.to_vec(),
+        ..TaskStatus::default()
     }
 }
 

@@ -195,5 +195,17 @@ fn describe(names: &[(TaskUid, Value)], plan: &Plan, changes: Vec<Value>, revisi
         .collect();
     let waits: Vec<Value> =
         plan.waits.iter().map(|wait| with_name(&wait.uid, json!({ "why": &*wait.why }))).collect();
-    json!({ "changes": changes, "placements": placements, "waits": waits, "revision": revision.to_string() })
+    let preemptions: Vec<Value> = plan
+        .preemptions
+        .iter()
+        .map(|preemption| {
+            let victims: Vec<&str> = preemption.victims.iter().map(|v| &*v.title).collect();
+            let fields = json!({ "node": preemption.node.as_str(), "victims": victims });
+            with_name(&preemption.uid, fields)
+        })
+        .collect();
+    json!({
+        "changes": changes, "placements": placements, "waits": waits, "preemptions": preemptions,
+        "revision": revision.to_string(),
+    })
 }

@@ -154,11 +154,11 @@ impl Board {
 /// What the agent of its node gets of a placed task.
 fn assignment(task: &Task) -> wire::Assignment {
     let status = task.status.clone().unwrap_or_default();
-    let stop = task
-        .metadata
-        .deletion_timestamp
-        .is_some()
-        .then(|| wire::Stop { grace_period_ms: grace_ms(task), reason: "Deleted".to_owned() });
+    let deleted = task.metadata.deletion_timestamp.is_some().then(|| "Deleted".to_owned());
+    let ordered = || status.stop.as_ref().map(|stop| format!("{}: {}", stop.reason, stop.message));
+    let stop = deleted
+        .or_else(ordered)
+        .map(|reason| wire::Stop { grace_period_ms: grace_ms(task), reason });
     wire::Assignment {
         uid: objects::uid_of(&task.metadata).to_owned(),
         namespace: task.metadata.namespace.clone().unwrap_or_default(),

@@ -67,6 +67,12 @@ pub(crate) async fn apply(
         status.started_at.clone_from(&started);
         status.finished_at.clone_from(&finished);
         status.report_sequence = report.sequence;
+        // One that was finished before the order came to it has done its work.
+        let unfinished = before == TaskPhase::Stopping || phase == TaskPhase::Failed;
+        if let Some(stop) = status.stop.clone().filter(|_| phase.is_terminal() && unfinished) {
+            status.phase = TaskPhase::Failed;
+            (status.reason, status.message) = (stop.reason, stop.message);
+        }
         let lease = status.lease.clone().filter(|_| phase.is_terminal());
         let mut ops = vec![objects::replace(stored, &task)];
         ops.extend(

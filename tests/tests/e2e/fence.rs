@@ -1,6 +1,5 @@
 //! A robot that is lost: what a person's word frees, and what holds when the person erred.
 
-
 use muster_api::condition;
 use muster_api::phase::TaskPhase;
 use muster_tests::{AgentOptions, Cluster, kernel, wait};

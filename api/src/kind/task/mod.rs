@@ -39,6 +39,9 @@ pub struct TaskSpec {
     /// More is more important; placed first.
     #[serde(default)]
     pub priority: i32,
+    /// Whether tasks of less priority may be ended to make room for this one.
+    #[serde(default, skip_serializing_if = "Preemption::is_default")]
+    pub preemption: Preemption,
     /// Where the task may run.
     #[serde(default)]
     pub placement: Placement,
@@ -58,6 +61,29 @@ pub struct TaskSpec {
     /// with actuators and Keep for others.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub on_disconnect: Option<OnDisconnect>,
+    /// How long the task may be on its node, seconds from when it was placed; then it is stopped, and has Failed with
+    /// the reason DeadlineExceeded. The controller keeps the time: a node without contact is told when it is back.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub active_deadline_seconds: Option<u32>,
+    /// How long the object stays after the task has ended, seconds; none: until somebody deletes it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub ttl_seconds_after_finished: Option<u32>,
+}
+
+/// What a task that finds no room may do about it.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+pub enum Preemption {
+    /// Tasks of less priority are ended, gracefully, when that makes room.
+    #[default]
+    LowerPriority,
+    /// It waits.
+    Never,
+}
+
+impl Preemption {
+    fn is_default(&self) -> bool {
+        *self == Preemption::default()
+    }
 }
 
 fn default_grace() -> u32 {
@@ -459,6 +485,12 @@ pub struct TaskStatus {
     /// Why it is not placed, per node (invariant 6).
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub why: Vec<NodeRefusal>,
+    /// The node where tasks are being ended to make room for this one.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub nominated_node: Option<String>,
+    /// The controller wants the task to end, and keeps its object.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub stop: Option<StopOrder>,
     /// Number of the agent's newest report that is in here: reports are applied once.
     #[serde(skip_serializing_if = "is_zero")]
     pub report_sequence: u64,
@@ -468,6 +500,25 @@ pub struct TaskStatus {
 fn is_zero(n: &u64) -> bool {
     *n == 0
 }
+
+/// An order of the controller to end a task; it is never taken back.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "camelCase")]
+pub struct StopOrder {
+    /// Why, one CamelCase word; the reason of the task's end.
+    pub reason: String,
+    /// Why, in a sentence.
+    pub message: String,
+    /// When it was given.
+    pub at: MicroTime,
+}
+
+/// Reason of a task that waits until others have ended to make room for it.
+pub const PREEMPTING: &str = "Preempting";
+/// Reason of a task that was ended to make room for one of more priority.
+pub const PREEMPTED: &str = "Preempted";
+/// Reason of a task whose `activeDeadlineSeconds` have passed.
+pub const DEADLINE_EXCEEDED: &str = "DeadlineExceeded";
 
 /// The lease that a task holds.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]

@@ -20,6 +20,11 @@ pub(super) fn rules(spec: &TaskSpec, violations: &mut Violations) {
             .invalid("spec.restartPolicy", "an executor's work is not run again by itself")
             .suggest("leave it out, or set Never");
     }
+    if spec.active_deadline_seconds == Some(0) {
+        violations
+            .invalid("spec.activeDeadlineSeconds", "0 lets nothing run")
+            .suggest("leave it out for no deadline");
+    }
     if spec.grace_period_seconds > MAX_GRACE_SECONDS {
         let reason = format!(
             "{} is more than the longest allowed, {MAX_GRACE_SECONDS}",
@@ -208,7 +213,8 @@ fn env_rules(env: &[EnvVar], path: &str, violations: &mut Violations) {
 }
 
 /// What of a spec may change while the task exists: nothing that would need another process.
-const MUTABLE: [&str; 2] = ["priority", "gracePeriodSeconds"];
+const MUTABLE: [&str; 4] =
+    ["priority", "gracePeriodSeconds", "activeDeadlineSeconds", "ttlSecondsAfterFinished"];
 
 /// What may not change while the task exists.
 pub(super) fn change_rules(old: &Value, new: &Value, violations: &mut Violations) {
@@ -253,7 +259,7 @@ fn differences(
         _ => {
             violations
                 .forbidden(path, "cannot change while the task exists")
-                .suggest("delete the task and create it again; only priority, gracePeriodSeconds and placement.tolerations may change");
+                .suggest("delete the task and create it again; only priority, gracePeriodSeconds, activeDeadlineSeconds, ttlSecondsAfterFinished and placement.tolerations may change");
         }
     }
 }

@@ -32,6 +32,11 @@ fn state(sheet: &mut Sheet, task: &Task, status: &TaskStatus, now: Timestamp) {
     sheet.field("Class", task.spec.resources.class());
     sheet.field("Priority", task.spec.priority.to_string());
     sheet.maybe("Node", status.node.clone());
+    sheet.maybe("Nominated", status.nominated_node.clone());
+    sheet.maybe("To end", status.stop.as_ref().map(|s| format!("{}: {}", s.reason, s.message)));
+    let seconds = |seconds: u32| format!("{seconds} s");
+    sheet.maybe("Deadline", task.spec.active_deadline_seconds.map(seconds));
+    sheet.maybe("Kept after its end", task.spec.ttl_seconds_after_finished.map(seconds));
     let cost = task.spec.placement.cost;
     sheet.maybe("Score", status.score.map(|s| columns::score(s, cost)));
     sheet.maybe("Lease", status.lease.as_ref().map(|l| format!("{}, epoch {}", l.name, l.epoch)));

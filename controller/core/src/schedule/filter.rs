@@ -135,7 +135,9 @@ pub(crate) fn reach_of(
 fn what_is_left(member: &Member, facts: &NodeFacts, demand: &Demand) -> Option<Refusal> {
     let resources = &demand.spec.resources;
     let groups = facts.groups_for(&resources.actuators);
-    match member.ledger.check(&resources.reserved(), &groups).err()? {
+    let who = (&demand.uid, demand.spec.priority);
+    match member.ledger.check_for(who, &resources.reserved(), &groups).err()? {
+        Denied::Kept { title } => Some(Refusal::Kept { title: title.to_string() }),
         Denied::Short(shortage) => Some(Refusal::Exhausted { shortage }),
         Denied::Held { group, holder } => {
             let title = member

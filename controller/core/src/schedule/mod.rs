@@ -6,7 +6,8 @@
 //!
 //! Order of tasks: priority, then who waited longest. Order of nodes: a task that needs computation
 //! only tries the cloud first; robots by score where there is an operation position; else by most
-//! free CR. Nodes with a taint of effect PreferNoSchedule come last.
+//! free CR. Nodes with a taint of effect PreferNoSchedule come last. A task that has no place may make room: see
+//! [`crate::preempt`].
 
 pub mod filter;
 pub mod score;
@@ -20,7 +21,8 @@ use muster_api::name::NodeName;
 
 use crate::cluster::{Cluster, NodeFacts};
 use crate::fairness::{Accounts, OverQuota, namespace_of};
-use crate::ledger::Reservation;
+use crate::ledger::{Reservation, Standing};
+use crate::preempt::{self, Preemption};
 use crate::report::Refusal;
 use crate::space::Slot;
 
@@ -38,12 +40,26 @@ pub struct Demand {
 }
 
 impl Demand {
-    fn reservation(&self, facts: &NodeFacts) -> Reservation {
+    /// What it would hold of a node.
+    #[must_use]
+    pub fn reservation(&self, facts: &NodeFacts) -> Reservation {
         Reservation {
             title: Arc::clone(&self.title),
             compute: self.spec.resources.reserved(),
             groups: facts.groups_for(&self.spec.resources.actuators),
+            standing: standing(&self.title, &self.spec, false),
         }
+    }
+}
+
+/// How a task stands that holds something.
+#[must_use]
+pub fn standing(title: &str, spec: &TaskSpec, stopping: bool) -> Standing {
+    let executor = spec.run.executor.as_ref();
+    Standing {
+        priority: spec.priority,
+        stopping,
+        executor: executor.map(|e| format!("{}/{}", namespace_of(title), e.task).into()),
     }
 }
 
@@ -76,6 +92,8 @@ pub struct Plan {
     pub binds: Vec<Bind>,
     /// Tasks that wait, each with its reasons.
     pub waits: Vec<Wait>,
+    /// Tasks that are to end, to make room for some of those that wait.
+    pub preemptions: Vec<Preemption>,
 }
 
 /// Most nodes that are named in a task's reasons; the others are counted. A status must not grow
@@ -91,6 +109,7 @@ pub fn schedule(cluster: &mut Cluster, demands: &mut [Demand]) -> Plan {
     let mut accounts = cluster.has_quotas().then(|| Accounts::of(cluster));
     for demand in demands.iter() {
         if let Some(over) = accounts.as_ref().and_then(|a| over_quota(cluster, a, demand)) {
+            cluster.unnominate(&demand.uid);
             plan.waits.push(Wait { uid: demand.uid.clone(), why: [quota_refusal(&over)].into() });
             continue;
         }
@@ -99,7 +118,16 @@ pub fn schedule(cluster: &mut Cluster, demands: &mut [Demand]) -> Plan {
             plan.waits.push(Wait { uid: demand.uid.clone(), why: Arc::clone(why) });
             continue;
         }
-        match choose(cluster, demand) {
+        let place = choose(cluster, demand);
+        if place.is_none() {
+            if let Some((preemption, why)) = preempt::make_room(cluster, demand) {
+                plan.waits.push(Wait { uid: demand.uid.clone(), why: [why].into() });
+                plan.preemptions.push(preemption);
+                continue;
+            }
+            cluster.unnominate(&demand.uid);
+        }
+        match place {
             Some(slot) => {
                 let bind = take(cluster, demand, slot);
                 if let Some(accounts) = accounts.as_mut() {
@@ -147,6 +175,7 @@ const HOPELESS_KEPT: usize = 8;
 
 fn asks_the_same(a: &TaskSpec, b: &TaskSpec) -> bool {
     a.resources == b.resources
+        && a.preemption == b.preemption
         && a.placement == b.placement
         && a.run.container.is_some() == b.run.container.is_some()
         && a.run.executor.is_none()
@@ -283,7 +312,10 @@ pub fn explain(cluster: &Cluster, demand: &Demand) -> Vec<(NodeName, Refusal)> {
 /// What ends by itself comes first, what the task's owner must change last.
 fn hardness(refusal: &Refusal) -> u8 {
     match refusal {
-        Refusal::LeaseHeld { .. } | Refusal::Exhausted { .. } | Refusal::NoExecutor { .. } => 0,
+        Refusal::LeaseHeld { .. }
+        | Refusal::Exhausted { .. }
+        | Refusal::Kept { .. }
+        | Refusal::NoExecutor { .. } => 0,
         Refusal::OutOfRange { .. } | Refusal::NoPose | Refusal::NotLocalized => 1,
         Refusal::NotReady { .. } | Refusal::Cordoned | Refusal::Tainted { .. } => 2,
         Refusal::TooSmall { .. } | Refusal::NoRuntime { .. } | Refusal::NoSpeed => 3,

@@ -1,0 +1,227 @@
+//! Tasks whose time has come: those that have been on their node for `activeDeadlineSeconds` are ordered to end, and
+//! objects of those that ended `ttlSecondsAfterFinished` ago are deleted.
+//!
+//! Each task with such a field has one entry in a queue by time. An entry only says when to look: what is done is decided
+//! by the object as it is then, so an entry that is out of date costs a look.
+
+use std::collections::{BTreeSet, HashMap};
+use std::sync::Arc;
+
+use jiff::{SignedDuration, Timestamp};
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::MicroTime;
+use muster_api::kind::task::{DEADLINE_EXCEEDED, StopOrder, Task};
+
+use super::{RETRY, next_events, watch_from_now};
+use crate::context::Context;
+use crate::objects::{self, TASKS};
+use crate::store::{Change, Key, Op, StoreError, Stored};
+
+/// What becomes of a task when its time has come.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Due {
+    /// It has been on its node long enough.
+    Stop(Timestamp),
+    /// It ended long ago.
+    Remove(Timestamp),
+}
+
+impl Due {
+    fn at(self) -> Timestamp {
+        match self {
+            Due::Stop(at) | Due::Remove(at) => at,
+        }
+    }
+}
+
+/// What waits for a task, and when; none: nothing.
+fn due(task: &Task) -> Option<Due> {
+    let status = task.status.as_ref()?;
+    let after = |from: &Option<MicroTime>, seconds: u32| {
+        from.as_ref()?.0.checked_add(SignedDuration::from_secs(i64::from(seconds))).ok()
+    };
+    if task.metadata.deletion_timestamp.is_some() {
+        return None;
+    }
+    if status.phase.is_terminal() {
+        // Fenced before it started: it has no end of its own, and is as old as its placement.
+        let ended = status.finished_at.clone().or_else(|| status.bound_at.clone());
+        return after(&ended, task.spec.ttl_seconds_after_finished?).map(Due::Remove);
+    }
+    if !status.phase.holds_node() || status.stop.is_some() {
+        return None;
+    }
+    after(&status.bound_at, task.spec.active_deadline_seconds?).map(Due::Stop)
+}
+
+/// When to look at which task.
+#[derive(Debug, Default)]
+struct Queue {
+    by_time: BTreeSet<(Timestamp, Key)>,
+    times: HashMap<Key, Timestamp>,
+}
+
+impl Queue {
+    fn set(&mut self, key: &Key, at: Option<Timestamp>) {
+        if let Some(before) = self.times.remove(key) {
+            self.by_time.remove(&(before, key.clone()));
+        }
+        if let Some(at) = at {
+            self.times.insert(key.clone(), at);
+            self.by_time.insert((at, key.clone()));
+        }
+    }
+
+    fn take_in(&mut self, change: Change, stored: &Stored) {
+        let concerns =
+            stored.mentions("activeDeadlineSeconds") || stored.mentions("ttlSecondsAfterFinished");
+        let task = (concerns && change == Change::Put).then(|| objects::read::<Task>(stored));
+        self.set(&stored.key, task.flatten().as_ref().and_then(due).map(Due::at));
+    }
+
+    fn pop(&mut self, now: Timestamp) -> Option<Key> {
+        let (_, key) = self.by_time.first().filter(|(at, _)| *at <= now)?.clone();
+        self.set(&key, None);
+        Some(key)
+    }
+}
+
+/// Works until dropped.
+pub async fn run(context: Arc<Context>) {
+    loop {
+        if let Err(error) = follow(&context).await {
+            tracing::warn!(error = crate::app::chain(&error), "deadlines are not kept yet");
+            tokio::time::sleep(RETRY).await;
+        }
+    }
+}
+
+/// Looks at every task, then at what changes; ends when it must begin anew.
+async fn follow(context: &Context) -> Result<(), StoreError> {
+    let mut watcher = watch_from_now(&context.store).await;
+    let mut queue = Queue::default();
+    for stored in context.store.list(TASKS, None).items {
+        queue.take_in(Change::Put, &stored);
+    }
+    loop {
+        let now = context.clock.now();
+        while let Some(key) = queue.pop(now) {
+            act(context, &key, now).await?;
+        }
+        let next = queue.by_time.first().map(|(at, _)| at.duration_since(now).unsigned_abs());
+        let wait = async {
+            match next {
+                Some(next) => tokio::time::sleep(next).await,
+                None => std::future::pending().await,
+            }
+        };
+        tokio::select! {
+            () = wait => {}
+            // Cancel safe: events that were not returned are returned by the next call.
+            events = next_events(&mut watcher) => {
+                let Some(events) = events else { return Ok(()) };
+                for event in events.iter().filter(|e| e.object.key.resource == TASKS) {
+                    queue.take_in(event.change, &event.object);
+                }
+            }
+        }
+    }
+}
+
+async fn act(context: &Context, key: &Key, now: Timestamp) -> Result<(), StoreError> {
+    let mut stopped = None;
+    objects::change(&context.store, key, |stored, mut task: Task| {
+        stopped = None;
+        match due(&task).filter(|due| due.at() <= now)? {
+            Due::Stop(_) => {
+                let seconds = task.spec.active_deadline_seconds.unwrap_or_default();
+                let stop = StopOrder {
+                    reason: DEADLINE_EXCEEDED.to_owned(),
+                    message: format!("was on its node for {seconds} s, its activeDeadlineSeconds"),
+                    at: MicroTime(now),
+                };
+                task.status.get_or_insert_default().stop = Some(stop);
+                let op = objects::replace(stored, &task);
+                stopped = Some(task);
+                Some(vec![op])
+            }
+            Due::Remove(_) if task.metadata.finalizers.as_ref().is_some_and(|f| !f.is_empty()) => {
+                let now = Timestamp::from_second(now.as_second()).unwrap_or(now);
+                let at = k8s_openapi::apimachinery::pkg::apis::meta::v1::Time(now);
+                task.metadata.deletion_timestamp = Some(at);
+                Some(vec![objects::replace(stored, &task)])
+            }
+            Due::Remove(_) => Some(vec![Op::remove(stored.key.clone(), stored.revision)]),
+        }
+    })
+    .await?;
+    if let Some(task) = stopped {
+        let message = task.status.as_ref().and_then(|s| s.stop.as_ref()).map(|s| s.message.clone());
+        context.events.warn_task(&task, DEADLINE_EXCEEDED, message.unwrap_or_default());
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::{Value, json};
+
+    use super::*;
+
+    fn task(spec: Value, status: Value) -> Task {
+        let mut object = json!({
+            "apiVersion": muster_api::API_VERSION, "kind": "Task", "metadata": {"name": "t"},
+            "spec": {"run": {"process": {"command": ["a"]}}}, "status": status,
+        });
+        for (key, value) in spec.as_object().expect("members") {
+            object["spec"][key] = value.clone();
+        }
+        serde_json::from_value(object).expect("a task")
+    }
+
+    fn at(text: &str) -> Timestamp {
+        text.parse().expect("a time")
+    }
+
+    /// Kubernetes' rules for `activeDeadlineSeconds` of a Pod and `ttlSecondsAfterFinished` of a Job.
+    #[test]
+    fn each_task_waits_for_what_its_spec_and_phase_say() {
+        let (bound, ended) = ("2026-01-01T00:00:00.000000Z", "2026-01-01T00:01:00.000000Z");
+        let deadline = json!({"activeDeadlineSeconds": 30, "ttlSecondsAfterFinished": 5});
+        let running = json!({"phase": "Running", "boundAt": bound});
+        let over = json!({"phase": "Failed", "boundAt": bound, "finishedAt": ended});
+        let stopped = json!({"phase": "Running", "boundAt": bound, "stop": {"reason": "Preempted", "message": "", "at": ended}});
+        let table = [
+            (json!({}), running.clone(), None),
+            (deadline.clone(), json!({"phase": "Pending"}), None),
+            (deadline.clone(), running.clone(), Some(Due::Stop(at("2026-01-01T00:00:30Z")))),
+            (deadline.clone(), stopped, None),
+            (deadline.clone(), over.clone(), Some(Due::Remove(at("2026-01-01T00:01:05Z")))),
+            (json!({"activeDeadlineSeconds": 30}), over, None),
+            (json!({"ttlSecondsAfterFinished": 0}), running, None),
+            (
+                json!({"ttlSecondsAfterFinished": 0}),
+                json!({"phase": "Failed", "boundAt": bound}),
+                Some(Due::Remove(at(bound))),
+            ),
+        ];
+        for (spec, status, expected) in table {
+            assert_eq!(due(&task(spec.clone(), status.clone())), expected, "{spec} {status}");
+        }
+    }
+
+    #[test]
+    fn the_queue_gives_what_is_due_once() {
+        let key = |name: &str| Key::namespaced(TASKS, "default", name);
+        let (one, two) = (at("2026-01-01T00:00:01Z"), at("2026-01-01T00:00:02Z"));
+        let mut queue = Queue::default();
+        queue.set(&key("a"), Some(two));
+        queue.set(&key("b"), Some(one));
+        queue.set(&key("a"), Some(one));
+        queue.set(&key("c"), Some(two));
+        assert_eq!(queue.pop(one), Some(key("a")));
+        assert_eq!(queue.pop(one), Some(key("b")));
+        assert_eq!(queue.pop(one), None);
+        queue.set(&key("c"), None);
+        assert_eq!(queue.pop(two), None);
+    }
+}
