@@ -23,7 +23,7 @@ use muster_api::kind::task::{NodeRefusal, Task, TaskSpec, TaskStatus};
 use muster_api::name::NodeName;
 use muster_api::phase::TaskPhase;
 use muster_api::pose::Pose;
-use muster_controller_core::cluster::Cluster;
+use muster_controller_core::cluster::{Cluster, Executor};
 use muster_controller_core::fairness::Accounts;
 use muster_controller_core::ledger::Reservation;
 use muster_controller_core::recent::Recent;
@@ -63,6 +63,8 @@ enum Question {
     Why { demand: Demand, answer: oneshot::Sender<Vec<NodeRefusal>> },
     /// A robot is somewhere else.
     Pose { node: NodeName, pose: Pose },
+    /// Which executors live on a node.
+    Executors { node: NodeName, executors: Vec<Executor> },
     /// Something for the frameworks' desk.
     Desk(desk::Request),
 }
@@ -108,6 +110,16 @@ impl Handle {
     /// When the controller ends.
     pub async fn desk(&self, request: desk::Request) -> Result<(), Ended> {
         self.questions.send(Question::Desk(request)).await.map_err(|_| Ended)
+    }
+
+    /// Says which executors live on a node: all of them.
+    ///
+    /// # Errors
+    ///
+    /// When the controller ends.
+    pub async fn executors(&self, node: NodeName, executors: Vec<Executor>) -> Result<(), Ended> {
+        let question = Question::Executors { node, executors };
+        self.questions.send(question).await.map_err(|_| Ended)
     }
 
     /// Says where a robot is now. Lost when the scheduler is busy: the next pose comes soon.
@@ -190,7 +202,7 @@ impl Scheduler {
     /// Looks at everything.
     async fn rebuild(&mut self) -> Watcher {
         let watcher = watch_from_now(&self.context.store).await;
-        self.cluster = Cluster::new();
+        let old = std::mem::take(&mut self.cluster);
         self.desk.begin_anew();
         self.waiting.clear();
         self.own.clear();
@@ -198,6 +210,10 @@ impl Scheduler {
             for stored in self.context.store.list(resource, None).items {
                 self.take_in(resource, Change::Put, &stored);
             }
+        }
+        // Agents say it once a session, and not to the store.
+        for member in old.all().filter(|member| !member.executors.is_empty()) {
+            self.cluster.set_executors(&member.name, member.executors.clone());
         }
         tracing::info!(
             nodes = self.cluster.members().count(),
@@ -336,6 +352,9 @@ impl Scheduler {
                 drop(answer.send(quota.into_iter().chain(nodes).collect()));
             }
             Question::Pose { node, pose } => self.cluster.set_pose(&node, &pose),
+            Question::Executors { node, executors } => {
+                self.cluster.set_executors(&node, executors);
+            }
             Question::Desk(request) => self.desk.take(&mut self.cluster, request),
         }
     }
