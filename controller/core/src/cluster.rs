@@ -325,6 +325,11 @@ impl Cluster {
         self.quotas.get(namespace)
     }
 
+    /// Every quota, by namespace.
+    pub fn quotas(&self) -> impl Iterator<Item = (&Arc<str>, &QuotaSpec)> {
+        self.quotas.iter()
+    }
+
     /// Whether any namespace has a quota.
     #[must_use]
     pub fn has_quotas(&self) -> bool {

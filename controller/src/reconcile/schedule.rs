@@ -34,6 +34,7 @@ use tokio_util::task::AbortOnDropHandle;
 
 use super::books::{Books, Page};
 use super::desk::{self, Desk};
+use super::quotas::{Counter, Counts};
 use super::{RETRY, bind, next_events, watch_from_now};
 use crate::context::Context;
 use crate::objects::{self, LEASES, NODES, QUOTAS, TASKS};
@@ -144,6 +145,7 @@ struct Waiting {
 pub struct Scheduler {
     context: Arc<Context>,
     books: Arc<Books>,
+    counter: Counter,
     questions: mpsc::Receiver<Question>,
     cluster: Cluster,
     desk: Desk,
@@ -158,12 +160,16 @@ pub struct Scheduler {
 impl Scheduler {
     /// A scheduler that knows nothing yet, and the handle to ask it.
     #[must_use]
-    pub fn new(context: Arc<Context>, books: Arc<Books>) -> (Self, Handle) {
+    pub fn new(
+        context: Arc<Context>,
+        (books, counts): (Arc<Books>, Arc<Counts>),
+    ) -> (Self, Handle) {
         let (sender, questions) = mpsc::channel(QUESTIONS);
         let scheduler = Scheduler {
             desk: Desk::new(Arc::clone(&context)),
             context,
             books,
+            counter: Counter::new(counts),
             questions,
             cluster: Cluster::new(),
             waiting: HashMap::new(),
@@ -250,6 +256,7 @@ impl Scheduler {
             let Some(lease) = objects::read::<Lease>(stored) else { return };
             let Ok(node) = NodeName::new(lease.spec.node.clone()) else { return };
             let status = lease.status.unwrap_or_default();
+            self.counter.changed();
             self.cluster.set_lease(
                 &node,
                 &lease.spec.group,
@@ -262,8 +269,14 @@ impl Scheduler {
     fn take_in_quota(&mut self, change: Change, stored: &Arc<Stored>) {
         let namespace = stored.key.namespace().unwrap_or_default();
         let quota = (change == Change::Put).then(|| objects::read::<Quota>(stored)).flatten();
-        self.cluster.set_quota(namespace, quota.map(|q| q.spec));
-        self.desk.quotas_changed();
+        // Somebody may have written another status.
+        self.counter.changed();
+        let spec = quota.map(|q| q.spec);
+        // Most changes are the writing of what the namespace has.
+        if self.cluster.quota(namespace) != spec.as_ref() {
+            self.cluster.set_quota(namespace, spec);
+            self.desk.quotas_changed();
+        }
     }
 
     fn quota_reason(&self, demand: &Demand) -> Option<NodeRefusal> {
@@ -372,7 +385,11 @@ impl Scheduler {
             retry = [binds, waits].into_iter().flatten().min();
         }
         let desk = self.desk.work(&mut self.cluster).await;
-        let retry = [retry, desk].into_iter().flatten().min();
+        if !self.dirty.is_empty() {
+            self.counter.changed();
+        }
+        let count = self.counter.work(&self.cluster);
+        let retry = [retry, desk, count].into_iter().flatten().min();
         for node in std::mem::take(&mut self.dirty) {
             if let Some(member) = self.cluster.member(&node) {
                 self.books.put(&node, Page::from(&member.ledger));

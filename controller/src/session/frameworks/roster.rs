@@ -64,8 +64,6 @@ impl Roster {
             |entry: &Entry| entry.open && !entry.framework.as_ref().is_some_and(|f| is_present(f));
         let roster = lock(&self.0);
         let orphans = roster.iter().filter(|(_, entry)| orphaned(entry));
-        let orphan =
-            |(uid, e): (&Box<str>, &Entry)| (e.key.clone(), uid.clone(), e.framework.clone());
-        orphans.map(orphan).collect()
+        orphans.map(|(uid, e)| (e.key.clone(), uid.clone(), e.framework.clone())).collect()
     }
 }
