@@ -20,6 +20,17 @@ pub(crate) struct Assignment {
     pub(crate) spec: TaskSpec,
     /// `<node>.<group>:<epoch>[,sequence…]`, when the task has the right to the actuators.
     pub(crate) lease: Option<String>,
+    /// Who launched it; none: a declared task.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(crate) framework: Option<Framework>,
+}
+
+/// An outside scheduler.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "camelCase")]
+pub(crate) struct Framework {
+    pub(crate) id: String,
+    pub(crate) name: String,
 }
 
 /// One task's file.

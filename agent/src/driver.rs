@@ -15,7 +15,7 @@ use std::time::Duration;
 
 use futures::future::{AbortHandle, Abortable, BoxFuture, FutureExt};
 use futures::stream::{FuturesUnordered, StreamExt};
-use muster_agent_core::desired::Desired;
+use muster_agent_core::desired::{Desired, StopTimes};
 use muster_agent_core::time::Boot;
 use muster_agent_core::workload::{Context, Effect, Event, Outcome, Response, Workload};
 use muster_api::id::TaskUid;
@@ -287,8 +287,9 @@ impl Driver {
                     self.operations.push(event.boxed());
                 }
                 Effect::Stop { grace_ms, .. } => {
-                    self.shared.desks.shut_down(&self.record.workload.uid, grace_ms);
-                    let operation = self.operation(effect);
+                    let uid = &self.record.workload.uid;
+                    let times = self.shared.desks.shut_down(uid, grace_ms).await;
+                    let operation = self.stop(times);
                     self.operations.push(operation);
                 }
                 Effect::Launch(_) | Effect::Watch(_) | Effect::Find(_) | Effect::Remove => {
@@ -339,13 +340,6 @@ impl Driver {
                 })
             }
             .boxed(),
-            Effect::Stop { grace_ms, .. } => async move {
-                let grace = Duration::from_millis(grace_ms);
-                let error = runtime.stop(&launch.id, grace).await.err()?;
-                tracing::warn!(id = %launch.id, error = chain(&error), "not stopped");
-                answer(Outcome::StopFailed)
-            }
-            .boxed(),
             Effect::Remove => {
                 self.shared.board.withdraw(&launch.id.uid);
                 async move {
@@ -361,9 +355,20 @@ impl Driver {
             Effect::Persist
             | Effect::Publish
             | Effect::CancelPrepare
+            | Effect::Stop { .. }
             | Effect::WakeAt(_)
             | Effect::Drop => futures::future::ready(None).boxed(),
         }
+    }
+
+    fn stop(&self, times: StopTimes) -> Operation {
+        let (runtime, id) = (Arc::clone(&self.runtime), self.id());
+        async move {
+            let error = runtime.stop(&id, times).await.err()?;
+            tracing::warn!(%id, error = chain(&error), "not stopped");
+            Some(Event::Attempt(id.attempt, Outcome::StopFailed))
+        }
+        .boxed()
     }
 
     fn launch(&self) -> Launch {
@@ -473,6 +478,7 @@ mod tests {
             name: "t".to_owned(),
             spec: task_spec,
             lease: None,
+            framework: None,
         };
         Begin::New(TaskUid::new("t"), Box::new(assignment), desired)
     }

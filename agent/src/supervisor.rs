@@ -11,7 +11,7 @@ use muster_api::wire::agent::v1 as proto;
 use tokio::sync::mpsc;
 use tokio::task::JoinSet;
 
-use crate::checkpoint::{Assignment, Record};
+use crate::checkpoint::{Assignment, Framework, Record};
 use crate::driver::{Begin, Message, Shared, drive};
 use crate::spec;
 
@@ -155,6 +155,10 @@ fn decode(message: proto::Assignments, known: &BTreeMap<TaskUid, Task>) -> (Assi
             name: wire.name.clone(),
             spec,
             lease: wire.lease.as_ref().map(lease_text),
+            framework: wire
+                .framework
+                .clone()
+                .map(|proto::Framework { id, name }| Framework { id, name }),
         };
         let task_spec = match spec::read(&wire.spec) {
             Ok(task_spec) => task_spec,

@@ -27,6 +27,7 @@ fn assign(controller: &Controller, uid: &str, spec: &serde_json::Value) {
             epoch: 3,
             sequence: vec![],
         }),
+        framework: Some(agent_proto::Framework { id: "f-1".to_owned(), name: "crew".to_owned() }),
         ..Default::default()
     });
 }
@@ -59,6 +60,7 @@ fn two_works(controller: &Controller, agent: &Agent) -> Executor {
     controller.wait("w1", "waiting", |report| report.reason == "AwaitingExecutor");
     assign_executor(controller);
     let mut executor = Executor::register(agent, "exec", &[]);
+    assert_eq!(executor.framework, ("f-1".to_owned(), "crew".to_owned()));
     let launch = executor.launched();
     assert_eq!((launch.task.as_str(), launch.name.as_str()), ("w1", "w1"));
     assert!(launch.data.unwrap().fields.contains_key("goal"));
@@ -121,6 +123,54 @@ fn works_run_end_and_are_ended_and_the_limits_follow() {
     assert_eq!((end.phase(), end.reason.as_str()), (TaskPhase::Failed, "Stopped"), "{end:?}");
     until("its own room", || (limits(&agent) == (100, 64 << 20)).then_some(()));
     assert!(lives(agent.main_pid("exec", 1)));
+    assert_eq!(
+        controller.executors(),
+        [vec![], vec!["exec".to_owned()]],
+        "each change is said once"
+    );
+}
+
+/// An executor that ends with 0 when `file` is there, and with 3 when it is signalled.
+fn assign_watching(controller: &Controller, file: &std::path::Path) {
+    let script =
+        format!("trap 'exit 3' TERM; while ! [ -e {} ]; do sleep 0.02; done", file.display());
+    assign(
+        controller,
+        "exec",
+        &json!({ "run": { "process": { "command": ["sh", "-c", script] } } }),
+    );
+}
+
+#[test]
+fn an_executor_that_must_end_is_asked_and_exits_by_itself() {
+    let (controller, dir) = (Controller::start(), tempfile::tempdir().unwrap());
+    let agent = Agent::start(&controller);
+    let file = dir.path().join("go");
+    assign_watching(&controller, &file);
+    let mut executor = Executor::register(&agent, "exec", &[]);
+    controller.wait_running("exec");
+    controller.stop("exec", 600_000);
+    let Heard::Shutdown(shutdown) = executor.hear() else { panic!("no shutdown") };
+    assert_eq!(shutdown.grace_period_ms, 600_000);
+    until("no executors", || {
+        controller.executors().last().is_some_and(Vec::is_empty).then_some(())
+    });
+    std::fs::write(&file, "").unwrap();
+    let end = controller.wait_end("exec");
+    assert_eq!((end.phase(), end.exit_code), (TaskPhase::Succeeded, Some(0)), "{end:?}");
+}
+
+#[test]
+fn an_executor_that_is_asked_and_stays_is_signalled() {
+    let (controller, dir) = (Controller::start(), tempfile::tempdir().unwrap());
+    let agent = Agent::start(&controller);
+    assign_watching(&controller, &dir.path().join("never"));
+    let mut executor = Executor::register(&agent, "exec", &[]);
+    controller.wait_running("exec");
+    controller.stop("exec", 6_000);
+    assert!(matches!(executor.hear(), Heard::Shutdown(_)));
+    let end = controller.wait_end("exec");
+    assert_eq!((end.exit_code, end.reason.as_str()), (Some(3), "Stopped"), "{end:?}");
 }
 
 #[test]
@@ -147,6 +197,9 @@ fn works_outlive_the_agent_and_end_with_their_executor() {
         assert!(!lives(pid), "{work} ended before its executor");
     }
     assert!(executor.is_closed());
+    until("no executors", || {
+        controller.executors().last().is_some_and(Vec::is_empty).then_some(())
+    });
     assign_work(&controller, "late");
     assert_eq!(controller.wait_end("late").reason, "ExecutorLost");
 }

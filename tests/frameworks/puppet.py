@@ -34,6 +34,7 @@ class Puppet(muster.Scheduler):
                     "sensors": sorted(offer.sensors),
                     "actuators": sorted(offer.actuators),
                     "kind": offer.kind.name,
+                    "executors": {executor.name: executor.task_id for executor in offer.executors},
                 }
                 for offer in self.held.values()
             },

@@ -10,7 +10,7 @@ class Worker(muster.Executor):
         self.tasks = {}
 
     def registered(self, driver, info):
-        driver.send_framework_message(b"ready")
+        driver.send_framework_message(f"ready {info.framework} {info.framework_id}".encode())
 
     def launch_task(self, driver, task):
         self.tasks[task.name] = task.task_id

@@ -82,12 +82,26 @@ impl AgentOptions {
 /// When it is not there.
 #[must_use]
 pub fn binary(name: &str) -> PathBuf {
+    built(name, "bins")
+}
+
+/// An example of the Rust SDK that was built with this test.
+///
+/// # Panics
+///
+/// When it is not there.
+#[must_use]
+pub fn example(name: &str) -> PathBuf {
+    built(&format!("examples/{name}"), "examples")
+}
+
+fn built(path: &str, what: &str) -> PathBuf {
     let test = std::env::current_exe().expect("a test has a path");
     let profile = test.parent().and_then(Path::parent).expect("tests are in target/PROFILE/deps");
-    let path = profile.join(name);
+    let path = profile.join(path);
     assert!(
         path.exists(),
-        "{} is missing; `cargo build --workspace --bins` makes it (tests/run does)",
+        "{} is missing; `cargo build --workspace --{what}` makes it (tests/run does)",
         path.display()
     );
     path

@@ -3,6 +3,8 @@
 use std::fs;
 use std::time::Duration;
 
+use rustix::process::{Pid, Signal, kill_process};
+
 /// A process, told from a later one with the same number by when it started.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Process {
@@ -39,9 +41,20 @@ pub fn with_env(name: &str, value: &str) -> Vec<Process> {
 ///
 /// When there is no such process.
 pub fn freeze(pid: u32, frozen: bool) {
-    use rustix::process::{Pid, Signal, kill_process};
+    signal(pid, if frozen { Signal::STOP } else { Signal::CONT });
+}
+
+/// Interrupts a process (SIGINT), as Ctrl-C does.
+///
+/// # Panics
+///
+/// When there is no such process.
+pub fn interrupt(pid: u32) {
+    signal(pid, Signal::INT);
+}
+
+fn signal(pid: u32, signal: Signal) {
     let pid = i32::try_from(pid).ok().and_then(Pid::from_raw).expect("a process number");
-    let signal = if frozen { Signal::STOP } else { Signal::CONT };
     kill_process(pid, signal).expect("it is there");
 }
 

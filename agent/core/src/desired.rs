@@ -22,6 +22,15 @@ pub struct StopOrder {
     pub reason: String,
 }
 
+/// When the processes of a task that must end are signalled, counted from the order on.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct StopTimes {
+    /// SIGTERM, milliseconds. 0 but for executors, which are asked first.
+    pub signal_ms: u64,
+    /// SIGKILL, milliseconds; what the task has in all.
+    pub kill_ms: u64,
+}
+
 /// What the controller wants of one task.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Desired {

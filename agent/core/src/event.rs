@@ -81,7 +81,7 @@ pub enum Effect {
     Stop {
         /// Which.
         attempt: u32,
-        /// Between SIGTERM and SIGKILL.
+        /// Until SIGKILL.
         grace_ms: u64,
     },
     /// Send a tick then.

@@ -17,12 +17,18 @@ use std::collections::{BTreeMap, BTreeSet};
 use muster_api::id::TaskUid;
 use serde::{Deserialize, Serialize};
 
+use crate::desired::StopTimes;
 use crate::observed::{End, Exit, Loss, Said};
 use crate::time::{Boot, Now, Wall};
 
 /// What an executor has beyond a work's grace to tell its end: the report has to travel, and be
 /// written down. After it the executor is ended, with all that it runs.
 pub const REPORT_MS: u64 = 1_000;
+
+/// An executor that must end is told so first, and has this part of its grace to end its works, say so and exit by
+/// itself; then it gets SIGTERM. Half: whoever listens rarely needs more for what a SIGTERM would leave it no time for,
+/// and whoever does not listen has the other half for its signal handler.
+pub const ASKED_FOR_PERCENT: u64 = 50;
 
 /// An order to end the executor that had no effect is given again after this.
 pub const END_AGAIN_MS: u64 = 5_000;
@@ -182,6 +188,11 @@ pub enum Event {
         /// Because contact was lost for too long.
         disconnected: bool,
     },
+    /// The executor itself must end.
+    ShutDown {
+        /// What it is given for it.
+        grace_ms: u64,
+    },
     /// A work's time to end may be over.
     Tick(TaskUid),
     /// Nobody asks for this work any more.
@@ -202,10 +213,24 @@ pub enum Effect {
         /// Milliseconds it is given.
         grace_ms: u64,
     },
+    /// Tell the executor to end everything and exit.
+    ShutDown {
+        /// Milliseconds it has.
+        grace_ms: u64,
+    },
     /// Tell the executor that its update is accounted for.
     Acknowledge(u64),
     /// End this attempt of the executor, without grace.
     EndExecutor(u32),
+}
+
+/// Until when an executor that must end has what.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+struct Ending {
+    /// To exit by itself.
+    signal: Boot,
+    /// At all.
+    kill: Boot,
 }
 
 /// One executor.
@@ -213,6 +238,10 @@ pub enum Effect {
 pub struct Executor {
     life: Life,
     connected: bool,
+    /// It has registered in this life.
+    registered: bool,
+    /// It must end.
+    ending: Option<Ending>,
     /// The newest update that was heard.
     sequence: u64,
     works: BTreeMap<TaskUid, Work>,
@@ -235,6 +264,26 @@ impl Executor {
     #[must_use]
     pub fn accepts(&self) -> bool {
         self.connected && matches!(self.life, Life::Live(_))
+    }
+
+    /// Whether it is an executor, as far as its life goes: it has registered, and is not being ended. Its connection
+    /// may be broken for the moment.
+    #[must_use]
+    pub fn is_there(&self) -> bool {
+        self.registered && matches!(self.life, Life::Live(_))
+    }
+
+    /// When its processes are to be signalled, for an order with this grace that it was told of: who cannot be asked
+    /// is signalled at once.
+    #[must_use]
+    pub fn stop_times(&self, grace_ms: u64, now: Boot) -> StopTimes {
+        let left = |at: Boot| at.0.saturating_sub(now.0);
+        match self.ending {
+            Some(Ending { signal, kill }) => {
+                StopTimes { signal_ms: left(signal), kill_ms: left(kill) }
+            }
+            None => StopTimes { signal_ms: 0, kill_ms: grace_ms },
+        }
     }
 
     /// A work of it.
@@ -285,6 +334,7 @@ impl Executor {
             Event::Stop { work, grace_ms, disconnected } => {
                 self.on_stop(&work, grace_ms, disconnected, now, &mut effects);
             }
+            Event::ShutDown { grace_ms } => self.on_shut_down(grace_ms, now, &mut effects),
             Event::Tick(uid) => self.on_tick(&uid, now, &mut effects),
             Event::Forget(uid) => {
                 self.works.remove(&uid);
@@ -299,7 +349,8 @@ impl Executor {
             for work in self.works.values_mut().filter(|work| work.is_live()) {
                 work.end(End::Lost(Loss::Executor), now);
             }
-            (self.connected, self.sequence) = (false, 0);
+            (self.connected, self.registered, self.sequence) = (false, false, 0);
+            self.ending = None;
         }
         self.life = life;
         // It may have connected before its runtime said that it lives.
@@ -375,7 +426,7 @@ impl Executor {
         now: Now,
         effects: &mut Vec<Effect>,
     ) {
-        self.connected = true;
+        (self.connected, self.registered) = (true, true);
         // An update that is accounted for may be of an earlier attempt of the work.
         let new = unacknowledged.iter().filter(|update| {
             self.works.get(&update.work).is_some_and(|work| update.sequence > work.sequence)
@@ -401,6 +452,26 @@ impl Executor {
             }
         }
         self.hand_over(effects);
+        self.ask(now, effects);
+    }
+
+    fn on_shut_down(&mut self, grace_ms: u64, now: Now, effects: &mut Vec<Effect>) {
+        let asked_for =
+            if self.connected { grace_ms.saturating_mul(ASKED_FOR_PERCENT) / 100 } else { 0 };
+        let (signal, kill) = (now.boot.plus(asked_for), now.boot.plus(grace_ms));
+        // A later order only hastens it.
+        let before = self.ending.unwrap_or(Ending { signal, kill });
+        self.ending =
+            Some(Ending { signal: signal.min(before.signal), kill: kill.min(before.kill) });
+        self.ask(now, effects);
+    }
+
+    /// Tells an executor that must end, in case the last telling was lost with its connection.
+    fn ask(&self, now: Now, effects: &mut Vec<Effect>) {
+        if let Some(Ending { kill, .. }) = self.ending.filter(|_| self.connected) {
+            let grace_ms = kill.0.saturating_sub(now.boot.0);
+            effects.push(Effect::ShutDown { grace_ms });
+        }
     }
 
     fn on_update(&mut self, update: Update, now: Now, effects: &mut Vec<Effect>) {
@@ -561,6 +632,45 @@ mod tests {
         assert!(executor.handle(Event::Tick(uid("a")), at(3_001)).is_empty());
         assert_eq!(executor.handle(Event::Tick(uid("a")), at(8_000)), ends);
         assert_eq!(end_of(&executor, "a"), None, "only the kernel shows that it is gone");
+    }
+
+    #[test]
+    fn an_executor_that_must_end_is_asked_before_it_is_signalled() {
+        let mut executor = busy();
+        let shut_down = |grace_ms| Event::ShutDown { grace_ms };
+        let told = |grace_ms| [Effect::ShutDown { grace_ms }];
+        let times = |signal_ms, kill_ms| StopTimes { signal_ms, kill_ms };
+        let _ = executor.handle(Event::Life(Life::Ending(1)), at(0));
+        assert_eq!(executor.handle(shut_down(10_000), at(0)), told(10_000));
+        assert_eq!(executor.stop_times(10_000, Boot(0)), times(5_000, 10_000));
+        assert_eq!(
+            executor.handle(shut_down(20_000), at(1_000)),
+            told(9_000),
+            "no more than before"
+        );
+        assert_eq!(executor.stop_times(20_000, Boot(1_000)), times(4_000, 9_000));
+        assert_eq!(executor.handle(shut_down(2_000), at(2_000)), told(2_000), "less hastens");
+        assert_eq!(executor.stop_times(2_000, Boot(2_000)), times(1_000, 2_000));
+        // What it was told may be lost with its connection.
+        let _ = executor.handle(Event::Disconnected, at(2_100));
+        let again = executor.handle(registered(&["a"]), at(2_500));
+        assert_eq!(again, told(1_500));
+        let _ = executor.handle(Event::Life(Life::Live(2)), at(3_000));
+        assert!(!executor.is_there(), "the next life has not registered");
+        assert_eq!(executor.stop_times(7, Boot(3_000)), times(0, 7));
+    }
+
+    #[test]
+    fn who_cannot_be_asked_is_signalled_at_once() {
+        let mut executor = busy();
+        assert!(executor.is_there());
+        let _ = executor.handle(Event::Disconnected, at(1));
+        assert!(executor.is_there(), "it comes back");
+        assert!(executor.handle(Event::ShutDown { grace_ms: 9_000 }, at(2)).is_empty());
+        let now = StopTimes { signal_ms: 0, kill_ms: 9_000 };
+        assert_eq!(executor.stop_times(9_000, Boot(2)), now);
+        let _ = executor.handle(Event::Life(Life::Ending(1)), at(2));
+        assert!(!executor.is_there());
     }
 
     #[test]

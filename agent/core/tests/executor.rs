@@ -39,6 +39,7 @@ enum Action {
     /// The agent dies after this many effects of the next decision.
     AgentDiesAfter(usize),
     Stop(usize, u64),
+    ShutDown(u64),
     Pass(u64),
     /// The end of a work is told.
     Tells(usize),
@@ -67,6 +68,7 @@ fn action() -> impl Strategy<Value = Action> {
         1 => Just(Action::AgentDies),
         1 => (0..4_usize).prop_map(Action::AgentDiesAfter),
         2 => (work(), 0..5_000_u64).prop_map(|(work, grace_ms)| Action::Stop(work, grace_ms)),
+        1 => (0..9_000_u64).prop_map(Action::ShutDown),
         2 => (1..8_000_u64).prop_map(Action::Pass),
         3 => work().prop_map(Action::Tells),
     ]
@@ -212,6 +214,11 @@ impl World {
                 // One answers for what it does not know, too.
                 self.over(&work, Said::Killed);
             }
+            Effect::ShutDown { .. } => {
+                for work in program.has.clone() {
+                    self.over(&work, Said::Killed);
+                }
+            }
             Effect::Acknowledge(sequence) => {
                 program.unacknowledged.retain(|update| update.sequence != sequence);
             }
@@ -301,6 +308,17 @@ impl World {
         }
     }
 
+    /// Whatever was ordered before, no order gives more than it says, and SIGTERM never follows SIGKILL.
+    fn shut_down(&mut self, grace_ms: u64) {
+        let mut agent = self.agent.clone();
+        let before = agent.stop_times(u64::MAX, Boot(self.now));
+        let _ = agent.handle(Event::ShutDown { grace_ms }, self.now());
+        let times = agent.stop_times(grace_ms, Boot(self.now));
+        assert!(times.signal_ms <= times.kill_ms && times.kill_ms <= grace_ms, "{times:?}");
+        assert!(times.kill_ms <= before.kill_ms, "{before:?}, then {times:?}");
+        self.handle(Event::ShutDown { grace_ms });
+    }
+
     fn pass(&mut self, millis: u64) {
         self.now += millis;
         for work in self.open() {
@@ -345,6 +363,7 @@ impl World {
             Action::AgentDies => self.agent_dies(),
             Action::AgentDiesAfter(count) => self.crash_after = Some(count),
             Action::Stop(work, grace_ms) => self.stop(&uid(work), grace_ms),
+            Action::ShutDown(grace_ms) => self.shut_down(grace_ms),
             Action::Pass(millis) => self.pass(millis),
             Action::Tells(work) => self.tells(&uid(work)),
         }

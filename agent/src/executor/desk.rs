@@ -1,12 +1,13 @@
 //! All executors of the node and their works. Every task is enrolled, because any may turn out to be
 //! an executor; the lock is never held across an await.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use bytes::Bytes;
+use muster_agent_core::desired::StopTimes;
 use muster_agent_core::executor::{Effect, Event, Executor, Life, Record, Update, Work, WorkState};
 use muster_agent_core::observed::{End, Said};
 use muster_agent_core::workload::{State, Workload};
@@ -20,7 +21,7 @@ use tokio::sync::watch;
 use super::frame::MESSAGE_MAX;
 use super::queue::Queue;
 use super::room::Room;
-use crate::checkpoint::{self, Checkpoint};
+use crate::checkpoint::{self, Checkpoint, Framework};
 use crate::clock;
 use crate::driver::chain;
 use crate::durable::{self, FileError, Keep};
@@ -54,6 +55,7 @@ pub(super) enum Choice {
 struct Desk {
     namespace: String,
     name: String,
+    framework: Option<Framework>,
     /// It will not run again.
     over: bool,
     registered_before: bool,
@@ -89,6 +91,8 @@ struct Handed {
 pub(crate) struct Desks {
     desks: Mutex<BTreeMap<TaskUid, Desk>>,
     changed: watch::Sender<()>,
+    /// Those that are executors, as far as is known.
+    executors: watch::Sender<BTreeSet<TaskUid>>,
     /// Messages to frameworks.
     messages: Queue<Message>,
     checkpoint: Checkpoint,
@@ -98,7 +102,8 @@ pub(crate) struct Desks {
 impl Desks {
     pub(crate) fn new(checkpoint: Checkpoint, node: String) -> Desks {
         let (desks, changed) = (Mutex::default(), watch::Sender::default());
-        Desks { desks, changed, messages: Queue::default(), checkpoint, node }
+        let (executors, messages) = (watch::Sender::default(), Queue::default());
+        Desks { desks, changed, executors, messages, checkpoint, node }
     }
 
     fn desks(&self) -> MutexGuard<'_, BTreeMap<TaskUid, Desk>> {
@@ -123,6 +128,7 @@ impl Desks {
         desks.entry(workload.uid.clone()).or_insert_with(|| Desk {
             namespace: assignment.namespace.clone(),
             name: assignment.name.clone(),
+            framework: assignment.framework.clone(),
             over: false,
             registered_before: false,
             machine: Executor::new(life),
@@ -172,14 +178,16 @@ impl Desks {
         };
         if !known {
             self.handle(&workload.uid, Event::Life(life)).await;
+            self.count_executors();
         }
     }
 
-    /// The task is to end within `grace_ms`: a well-meaning executor ends its works itself.
-    pub(crate) fn shut_down(&self, uid: &TaskUid, grace_ms: u64) {
-        let grace_period_ms = u32::try_from(grace_ms).unwrap_or(u32::MAX);
-        if let Some(out) = self.desks().get(uid).and_then(|desk| desk.out.as_ref()) {
-            out.push(event(Say::Shutdown(proto::Shutdown { grace_period_ms })), 0);
+    /// The task is to end within `grace_ms`. An executor is told so; says when its processes are to be signalled.
+    pub(crate) async fn shut_down(&self, uid: &TaskUid, grace_ms: u64) -> StopTimes {
+        self.handle(uid, Event::ShutDown { grace_ms }).await;
+        match self.desks().get(uid) {
+            Some(desk) => desk.machine.stop_times(grace_ms, clock::boot()),
+            None => StopTimes { signal_ms: 0, kill_ms: grace_ms },
         }
     }
 
@@ -187,6 +195,24 @@ impl Desks {
     pub(crate) fn dismiss(&self, uid: &TaskUid) {
         self.desks().remove(uid);
         self.changed.send_replace(());
+        self.count_executors();
+    }
+
+    /// The tasks that have registered as executors and may be alive.
+    pub(crate) fn executors(&self) -> watch::Receiver<BTreeSet<TaskUid>> {
+        self.executors.subscribe()
+    }
+
+    fn count_executors(&self) {
+        let desks = self.desks();
+        let there = desks.iter().filter(|(_, desk)| desk.machine.is_there());
+        let there: BTreeSet<TaskUid> = there.map(|(uid, _)| uid.clone()).collect();
+        // Under the lock: an older count never replaces a newer one.
+        self.executors.send_if_modified(|executors| {
+            let changed = *executors != there;
+            *executors = there;
+            changed
+        });
     }
 
     pub(super) fn choose(&self, namespace: &str, name: &str) -> Choice {
@@ -264,6 +290,10 @@ impl Desks {
                     let kill = proto::Kill { task: work.to_string(), grace_period_ms };
                     self.send(executor, Say::Kill(kill));
                 }
+                Effect::ShutDown { grace_ms } => {
+                    let grace_period_ms = u32::try_from(grace_ms).unwrap_or(u32::MAX);
+                    self.send(executor, Say::Shutdown(proto::Shutdown { grace_period_ms }));
+                }
                 Effect::Acknowledge(sequence) => {
                     self.send(executor, Say::Acknowledged(proto::Acknowledged { sequence }));
                 }
@@ -331,13 +361,14 @@ impl Desks {
         desk.machine.life().attempt()?;
         // A former connection may have been dropped without a word; nothing follows from it.
         let _ = desk.machine.handle(Event::Disconnected, clock::now());
+        let framework = desk.framework.clone().unwrap_or_default();
         let greeting = proto::Registered {
             executor: uid.to_string(),
             namespace: desk.namespace.clone(),
-            // Assignments do not say whose a task is.
-            framework: String::new(),
+            framework: framework.name,
             node: self.node.clone(),
             reregistered: std::mem::replace(&mut desk.registered_before, true),
+            framework_id: framework.id,
         };
         let out = Arc::new(Queue::default());
         out.push(event(Say::Registered(greeting)), 0);
@@ -359,6 +390,7 @@ impl Desks {
         let works = register.tasks.into_iter().map(TaskUid::new).collect();
         let unacknowledged = register.unacknowledged.into_iter().filter_map(update).collect();
         self.handle(uid, Event::Registered { works, unacknowledged }).await;
+        self.count_executors();
     }
 
     pub(super) async fn updated(&self, uid: &TaskUid, wire: proto::StatusUpdate) {

@@ -1,8 +1,8 @@
 //! An executor's limits: its own resources and those of its live works.
 
 use std::sync::Arc;
-use std::time::Duration;
 
+use muster_agent_core::desired::StopTimes;
 use muster_api::id::TaskUid;
 use tokio::sync::Mutex;
 
@@ -46,7 +46,7 @@ impl Room {
 
     /// Ends the executor, with all that it runs.
     pub(super) async fn end(&self, id: &AttemptId) -> Result<(), RuntimeError> {
-        self.runtime.stop(id, Duration::ZERO).await
+        self.runtime.stop(id, StopTimes { signal_ms: 0, kill_ms: 0 }).await
     }
 }
 

@@ -8,6 +8,7 @@ use std::time::Duration;
 use bytes::Bytes;
 use futures::future::{BoxFuture, FutureExt};
 use futures::stream::{self, BoxStream, StreamExt};
+use muster_agent_core::desired::StopTimes;
 use muster_agent_core::executor::{Event, Life, Stage, Work};
 use muster_agent_core::observed::{End, Exit, Loss, Observed, Started};
 use muster_agent_core::time::Boot;
@@ -204,10 +205,10 @@ impl Runtime for WorkRuntime {
     fn stop<'a>(
         &'a self,
         id: &'a AttemptId,
-        grace: Duration,
+        times: StopTimes,
     ) -> BoxFuture<'a, Result<(), RuntimeError>> {
         async move {
-            let grace_ms = u64::try_from(grace.as_millis()).unwrap_or(u64::MAX);
+            let grace_ms = times.kill_ms;
             if let Some((executor, ..)) = self.desks.look(id) {
                 let stop = Event::Stop { work: id.uid.clone(), grace_ms, disconnected: false };
                 self.desks.handle(&executor, stop).await;

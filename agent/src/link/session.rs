@@ -9,17 +9,19 @@
 //! Level-triggered: a Hello carries every report and the whole node; what was sent in a session is
 //! sent again until it is acknowledged. Losing a session loses nothing but time.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::Duration;
 
 use hyper_util::rt::TokioIo;
 use muster_agent_core::time::Boot;
+use muster_api::id::TaskUid;
 use muster_api::wire::agent::v1 as proto;
+use muster_api::wire::{HTTP2_FRAME, HTTP2_WINDOW};
 use proto::agent_message::Body as Say;
 use proto::controller_message::Body as Hear;
 use rustls::ClientConfig;
-use tokio::sync::mpsc;
+use tokio::sync::{mpsc, watch};
 use tokio::task::{AbortHandle, JoinSet};
 use tokio::time::{Instant, MissedTickBehavior};
 use tokio_stream::wrappers::ReceiverStream;
@@ -124,6 +126,9 @@ impl Link {
         let endpoint = Endpoint::from_shared(format!("http://{}", self.address))
             .map_err(SessionError::Connect)?
             .connect_timeout(DEAF_AFTER)
+            .initial_stream_window_size(HTTP2_WINDOW)
+            .initial_connection_window_size(HTTP2_WINDOW)
+            .max_frame_size(HTTP2_FRAME)
             .http2_keep_alive_interval(DEAF_AFTER / 2)
             .keep_alive_timeout(DEAF_AFTER / 2)
             .keep_alive_while_idle(true);
@@ -204,6 +209,8 @@ impl Session<'_> {
         let mut beats = tokio::time::interval(interval);
         beats.set_missed_tick_behavior(MissedTickBehavior::Delay);
         let shared = Arc::clone(&self.link.shared);
+        let mut executors = shared.desks.executors();
+        self.say_executors(&mut executors).await?;
         let mut last_heard = Instant::now();
         loop {
             // Every arm is cancel-safe: a stream's next message stays in the stream, a permit that
@@ -223,6 +230,8 @@ impl Session<'_> {
                     self.say(Say::Message(message)).await?;
                 }
                 () = shared.board.changed() => self.say_reports().await?,
+                // Closed: the desks end with the agent.
+                Ok(()) = executors.changed() => self.say_executors(&mut executors).await?,
                 _ = beats.tick() => {
                     if last_heard.elapsed() > DEAF_AFTER.max(interval * 4) {
                         return Err(SessionError::Deaf);
@@ -294,6 +303,14 @@ impl Session<'_> {
             }
         }
         Ok(())
+    }
+
+    async fn say_executors(
+        &self,
+        executors: &mut watch::Receiver<BTreeSet<TaskUid>>,
+    ) -> Result<(), SessionError> {
+        let tasks = executors.borrow_and_update().iter().map(ToString::to_string).collect();
+        self.say(Say::Executors(proto::Executors { tasks })).await
     }
 
     async fn say_heartbeat(&mut self) -> Result<(), SessionError> {

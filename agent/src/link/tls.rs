@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 
+use muster_api::wire::READ_BUFFER;
 use rustls::client::WebPkiServerVerifier;
 use rustls::client::danger::{HandshakeSignatureValid, ServerCertVerified, ServerCertVerifier};
 use rustls::crypto::{CryptoProvider, ring};
@@ -10,6 +11,7 @@ use rustls::pki_types::{CertificateDer, PrivateKeyDer, ServerName, UnixTime};
 use rustls::{
     CertificateError, ClientConfig, DigitallySignedStruct, Error, RootCertStore, SignatureScheme,
 };
+use tokio::io::BufReader;
 use tokio::net::TcpStream;
 use tokio_rustls::TlsConnector;
 use tokio_rustls::client::TlsStream;
@@ -90,7 +92,7 @@ pub(crate) fn mutual(
 pub(crate) async fn connect(
     address: &Address,
     config: Arc<ClientConfig>,
-) -> Result<TlsStream<TcpStream>, ConnectError> {
+) -> Result<TlsStream<BufReader<TcpStream>>, ConnectError> {
     let host = ServerName::try_from(address.host.clone())
         .map_err(|_| ConnectError::Host(address.host.clone()))?;
     let tcp = TcpStream::connect((address.host.as_str(), address.port))
@@ -99,7 +101,7 @@ pub(crate) async fn connect(
     // Reports and heartbeats are small, and somebody waits for each.
     let _ = tcp.set_nodelay(true);
     TlsConnector::from(config)
-        .connect(host, tcp)
+        .connect(host, BufReader::with_capacity(READ_BUFFER, tcp))
         .await
         .map_err(|source| ConnectError::Tls { address: address.to_string(), source })
 }

@@ -2,11 +2,11 @@
 
 use std::collections::VecDeque;
 use std::sync::Mutex;
-use std::time::Duration;
 
 use bytes::Bytes;
 use futures::future::{BoxFuture, FutureExt};
 use futures::stream::{BoxStream, StreamExt};
+use muster_agent_core::desired::StopTimes;
 use muster_agent_core::observed::{Exit, Observed};
 use muster_agent_core::workload::Failure;
 use muster_api::id::TaskUid;
@@ -89,7 +89,7 @@ impl Runtime for Fake {
     fn stop<'a>(
         &'a self,
         id: &'a AttemptId,
-        _: Duration,
+        _: StopTimes,
     ) -> BoxFuture<'a, Result<(), RuntimeError>> {
         self.ask("stop", id);
         async { Ok(()) }.boxed()

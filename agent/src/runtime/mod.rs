@@ -18,11 +18,10 @@ pub(crate) mod launch;
 pub(crate) mod logs;
 pub(crate) mod process;
 
-use std::time::Duration;
-
 use bytes::Bytes;
 use futures::future::BoxFuture;
 use futures::stream::BoxStream;
+use muster_agent_core::desired::StopTimes;
 use muster_agent_core::observed::{Exit, Observed, Started};
 use muster_agent_core::workload::Failure;
 use muster_api::id::TaskUid;
@@ -84,11 +83,11 @@ pub(crate) trait Runtime: Send + Sync + std::fmt::Debug {
     fn find<'a>(&'a self, launch: &'a Launch) -> BoxFuture<'a, Result<Observed, RuntimeError>>;
     /// Resolves when no process of the attempt is left.
     fn wait<'a>(&'a self, launch: &'a Launch) -> BoxFuture<'a, Exit>;
-    /// Orders the kill ladder; does not wait for its end. A second order with less grace hastens it.
+    /// Orders the kill ladder; whoever orders does not wait for its end. A later order hastens it, and never delays it.
     fn stop<'a>(
         &'a self,
         id: &'a AttemptId,
-        grace: Duration,
+        times: StopTimes,
     ) -> BoxFuture<'a, Result<(), RuntimeError>>;
     /// Holds a running attempt to other limits from now on; each one is read back.
     fn resize<'a>(

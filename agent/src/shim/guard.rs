@@ -1,8 +1,7 @@
 //! The guard of a container: waits until the container is gone, or contact is; then it ends the
 //! container's processes, and says that it was it.
 
-use std::time::Duration;
-
+use muster_agent_core::desired::StopTimes;
 use rustix::event::{PollFd, PollFlags, Timespec};
 use rustix::process::{Pid, PidfdFlags, pidfd_open};
 
@@ -32,7 +31,7 @@ pub(super) fn guard(
         if ladder.is_idle() && contact.is_lost() {
             // Said first: whoever sees the end must find the reason.
             dir.write_disconnected()?;
-            ladder.stop(&reach, Duration::from_millis(order.launch.grace_ms));
+            ladder.stop(StopTimes { signal_ms: 0, kill_ms: order.launch.grace_ms });
         }
         let pause = ladder.step(&reach).map(|pause| Timespec {
             tv_sec: i64::try_from(pause.as_secs()).unwrap_or(i64::MAX),

@@ -4,6 +4,7 @@ use std::io;
 use std::os::fd::{AsFd, FromRawFd, OwnedFd};
 use std::time::Duration;
 
+use muster_agent_core::desired::StopTimes;
 use muster_agent_core::observed::End;
 use rustix::event::{PollFd, PollFlags, Timespec};
 use rustix::time::{
@@ -65,7 +66,6 @@ pub(super) struct Ended {
 struct Watch<'a> {
     dir: &'a AttemptDir,
     order: &'a Order,
-    reach: &'a Reach,
     main: i32,
     end: Option<End>,
     ladder: Ladder,
@@ -87,7 +87,6 @@ pub(super) fn watch(
     let mut watch = Watch {
         dir,
         order,
-        reach,
         main: started.pid,
         end: None,
         ladder: Ladder::Idle,
@@ -100,9 +99,12 @@ pub(super) fn watch(
         watch.reap();
         let pause = match (&watch.end, reach) {
             (Some(end), reach) if reach.is_empty() => break end.clone(),
-            (Some(_), _) if watch.ladder.is_idle() => {
+            (Some(_), _) => {
                 // The program is the attempt: what it leaves behind does not live on.
-                watch.ladder.kill();
+                if watch.ladder.is_idle() {
+                    watch.ladder.kill();
+                }
+                watch.ladder.signal_now();
                 watch.ladder.step(reach)
             }
             _ => watch.ladder.step(reach),
@@ -146,7 +148,7 @@ impl Watch<'_> {
         }
         if self.contact.as_mut().is_some_and(Contact::is_lost) && !self.disconnected {
             self.disconnected = true;
-            self.ladder.stop(self.reach, Duration::from_millis(self.order.launch.grace_ms));
+            self.ladder.stop(StopTimes { signal_ms: 0, kill_ms: self.order.launch.grace_ms });
         }
         for pump in pumps {
             pump.drain(log);
@@ -156,12 +158,12 @@ impl Watch<'_> {
 
     fn look_for_order(&mut self) {
         // A file that cannot be read is an order all the same, without grace to wait for.
-        let grace = match self.dir.stop() {
+        let times = match self.dir.stop() {
             Ok(None) => return,
-            Ok(Some(stop)) => Duration::from_millis(stop.grace_ms),
-            Err(_) => Duration::ZERO,
+            Ok(Some(stop)) => StopTimes { signal_ms: stop.signal_ms, kill_ms: stop.grace_ms },
+            Err(_) => StopTimes { signal_ms: 0, kill_ms: 0 },
         };
-        self.ladder.stop(self.reach, grace);
+        self.ladder.stop(times);
     }
 
     fn reap(&mut self) {

@@ -52,6 +52,7 @@ struct Seen {
     beats: u64,
     logs: BTreeMap<u64, (Vec<u8>, Option<String>)>,
     messages: Vec<proto::Message>,
+    executors: Vec<Vec<String>>,
     session: Option<mpsc::UnboundedSender<Result<proto::ControllerMessage, Status>>>,
     /// What every session begins with.
     assignments: BTreeMap<String, proto::Assignment>,
@@ -245,6 +246,11 @@ impl Controller {
     /// What executors said to frameworks.
     pub fn messages(&self) -> Vec<proto::Message> {
         self.seen(|seen| seen.messages.clone())
+    }
+
+    /// The executors that were said to be there, each time.
+    pub fn executors(&self) -> Vec<Vec<String>> {
+        self.seen(|seen| seen.executors.clone())
     }
 
     pub fn cancel_logs(&self, id: u64) {
@@ -447,6 +453,10 @@ fn take(seen: &mut Seen, heard: Heard) {
             let ack = proto::TaskReportAck { uid: report.uid.clone(), sequence: report.sequence };
             seen.reports.entry(report.uid.clone()).or_default().push(report);
             Some(Say::Task(ack))
+        }
+        Heard::Executors(executors) => {
+            seen.executors.push(executors.tasks);
+            None
         }
         Heard::Message(message) => {
             seen.messages.push(message);

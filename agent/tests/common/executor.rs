@@ -15,6 +15,8 @@ use super::until;
 pub struct Executor {
     stream: UnixStream,
     sequence: u64,
+    /// Id and name of its framework, as it was told.
+    pub framework: (String, String),
 }
 
 impl Executor {
@@ -24,7 +26,7 @@ impl Executor {
         let socket = agent.task_dir(uid).join("executor/socket");
         let stream = until("an executor's socket", || UnixStream::connect(&socket).ok());
         stream.set_read_timeout(Some(super::PATIENCE)).unwrap();
-        Executor { stream, sequence: 0 }
+        Executor { stream, sequence: 0, framework: Default::default() }
     }
 
     pub fn show(&mut self, token: &str, works: &[&str]) {
@@ -44,6 +46,7 @@ impl Executor {
         executor.show(record["token"].as_str().unwrap(), works);
         let Heard::Registered(greeting) = executor.hear() else { panic!("no greeting") };
         assert_eq!((greeting.executor.as_str(), greeting.node.as_str()), (uid, "robot-1"));
+        executor.framework = (greeting.framework_id, greeting.framework);
         executor
     }
 

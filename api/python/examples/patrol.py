@@ -36,6 +36,7 @@ class Post:
     kind: muster.NodeKind
     #: Empty: vacant. Then the launch is under way, or ``task_id`` is known.
     node: str = ""
+    task_name: str = ""
     task_id: str = ""
     failures: int = 0
 
@@ -50,7 +51,7 @@ class Post:
         return offer.kind is self.kind and able and offer.free.covers(muster.Compute.of(*NEEDS[self.kind]))
 
     def vacate(self) -> None:
-        self.node = self.task_id = ""
+        self.node = self.task_name = self.task_id = ""
 
 
 class Patrol(muster.Scheduler):
@@ -90,12 +91,14 @@ class Patrol(muster.Scheduler):
     def _launch(self, driver: muster.SchedulerDriver, post: Post, offer: muster.Offer) -> None:
         # The name says the role, so that a restarted patrol knows whose task it finds.
         name = f"{self._name}-{post.role}-{uuid.uuid4().hex[:8]}"
-        post.node = offer.node
+        post.node, post.task_name = offer.node, name
         print(f"{post.role}: {offer.node}", flush=True)
         result = driver.launch_tasks(offer, post.task(offer).named(name))
-        result.add_done_callback(lambda done: self._launched(driver, post, done))
+        result.add_done_callback(lambda done: self._launched(driver, post, name, done))
 
-    def _launched(self, driver: muster.SchedulerDriver, post: Post, done: muster.Launching) -> None:
+    def _launched(self, driver: muster.SchedulerDriver, post: Post, name: str, done: muster.Launching) -> None:
+        if post.task_name != name:  # It has ended already.
+            return
         try:
             (launched,) = done.result()
         except muster.CallRefused as refused:
@@ -113,10 +116,12 @@ class Patrol(muster.Scheduler):
         self._look(driver)
 
     def status_update(self, driver: muster.SchedulerDriver, update: muster.TaskStatus) -> None:
-        post = next((post for post in self._posts if post.task_id == update.task_id), None)
+        # The first update of a task may come before the answer to its launch.
+        post = next((p for p in self._posts if update.task_id == p.task_id or update.name == p.task_name), None)
         if post is None:
             self._found(driver, update)
             return
+        post.task_id = update.task_id
         why = f" ({update.reason}: {update.message})" if update.reason else ""
         print(f"{post.role} on {update.node}: {update.state.name}{why}", flush=True)
         if update.state is muster.TaskState.RUNNING:
@@ -134,7 +139,7 @@ class Patrol(muster.Scheduler):
             driver.kill_task(update.task_id)
             return
         print(f"{post.role}: found on {update.node}", flush=True)
-        post.node, post.task_id = update.node, update.task_id
+        post.node, post.task_name, post.task_id = update.node, update.name, update.task_id
         self._look(driver)
 
     def _failed(self, driver: muster.SchedulerDriver, post: Post) -> None:

@@ -37,7 +37,12 @@ class FakeConnection:
         register = self.expect("register")
         self.send(
             registered=pb.Registered(
-                executor="e-1", namespace="default", framework="deliver", node="turtlebot-1", reregistered=reregistered
+                executor="e-1",
+                namespace="default",
+                framework="deliver",
+                framework_id="f-1",
+                node="turtlebot-1",
+                reregistered=reregistered,
             )
         )
         return register

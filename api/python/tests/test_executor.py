@@ -30,7 +30,7 @@ def executor(agent):
     register = connection.registered()
     assert (register.token, list(register.tasks), list(register.unacknowledged)) == ("secret", [], [])
     (info,) = recorder.heard.expect("registered")
-    assert info == muster.ExecutorInfo("e-1", "default", "deliver", "turtlebot-1")
+    assert info == muster.ExecutorInfo("e-1", "default", "deliver", "turtlebot-1", "f-1")
     yield driver, recorder.heard, connection
     driver.abort()
     assert driver.join(PATIENCE) in (muster.DriverState.STOPPED, muster.DriverState.ABORTED)

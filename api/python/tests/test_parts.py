@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import ast
 import base64
 import json
+import re
 import types
+from pathlib import Path
 
 import pytest
 
@@ -21,6 +24,9 @@ from muster._yaml import YamlError, parse
 from muster.model import FrameworkInfo, TaskStatus
 from muster.quantity import cpu_millis, memory_bytes
 from muster.task import plain
+
+
+ROOT = Path(__file__).parent.parent
 
 
 def encoded(text):
@@ -248,3 +254,9 @@ def test_the_state_file_is_written_whole_and_for_one_framework(tmp_path):
     (tmp_path / "state").write_text("{}")
     with pytest.raises(muster.ConfigError, match="not a framework's state"):
         file.read(info)
+
+
+@pytest.mark.parametrize("file", sorted(ROOT.glob("src/muster/*.py")) + sorted(ROOT.glob("examples/*.py")), ids=str)
+def test_the_oldest_python_that_is_promised_reads_it(file):
+    promised = re.search(r'requires-python = ">=3\.(\d+)"', (ROOT / "pyproject.toml").read_text())
+    ast.parse(file.read_text(), file.name, feature_version=(3, int(promised.group(1))))

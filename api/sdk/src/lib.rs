@@ -47,7 +47,7 @@ pub use scheduler::{Scheduler, SchedulerDriver};
 /// Messages of the session that callbacks and events carry as they are; `framework.proto` documents their fields.
 pub mod wire {
     pub use muster_api::wire::framework::v1::{
-        Compute, Cost, ExecutorLost, Launched, Message, NodeKind, NodeLost, Offer, Pose,
+        Compute, Cost, Executor, ExecutorLost, Launched, Message, NodeKind, NodeLost, Offer, Pose,
         RescindReason, TaskState, Update,
     };
 }

@@ -42,6 +42,7 @@ impl Connection {
             executor: "e1".to_owned(),
             namespace: "team".to_owned(),
             framework: "deliver".to_owned(),
+            framework_id: "f1".to_owned(),
             node: "tb1".to_owned(),
             reregistered: !register.tasks.is_empty(),
         };
@@ -89,7 +90,10 @@ impl Runner {
 
 impl Executor for Runner {
     async fn registered(&mut self, _: &ExecutorHandle, registration: Registration) {
-        self.note(format!("registered for {}", registration.framework));
+        self.note(format!(
+            "registered for {} {}",
+            registration.framework, registration.framework_id
+        ));
     }
 
     async fn reregistered(&mut self, _: &ExecutorHandle) {
@@ -157,7 +161,7 @@ async fn tasks_are_launched_killed_and_shut_down() {
     let mut connection = Connection::accept(&agent.listener).await;
     let register = connection.register().await;
     assert_eq!((register.token.as_str(), register.tasks.len()), ("secret", 0));
-    assert_eq!(agent.note().await, "registered for deliver");
+    assert_eq!(agent.note().await, "registered for deliver f1");
     for task in ["a", "b"] {
         connection.launch(task).await;
         assert_eq!(agent.note().await, format!("launch {task} [1,2] Some(4)"));
@@ -188,7 +192,7 @@ async fn an_agent_that_comes_back_is_told_what_it_missed() {
     let mut agent = Agent::start();
     let mut connection = Connection::accept(&agent.listener).await;
     connection.register().await;
-    assert_eq!(agent.note().await, "registered for deliver");
+    assert_eq!(agent.note().await, "registered for deliver f1");
     for (task, sequence) in [("a", 1), ("b", 2)] {
         connection.launch(task).await;
         agent.note().await;

@@ -12,7 +12,6 @@ use serde_json::Value;
 
 use super::{KindInfo, admit_spec, any_change};
 use crate::quantity::{Bytes, MilliCpu};
-use crate::resource::Compute;
 use crate::validate::Violations;
 
 /// The name that every Quota has.
@@ -61,14 +60,29 @@ pub struct Limits {
     pub extended: BTreeMap<String, u64>,
 }
 
-/// What the namespace has.
+/// What the namespace has of what it may have, as the scheduler's books last said; a fraction of a second behind them.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "camelCase", default)]
 pub struct QuotaStatus {
-    /// CR that its tasks have reserved, as far as it is written down.
-    pub used: Compute,
-    /// Leases that its tasks hold.
+    /// The limits that hold.
+    pub hard: Limits,
+    /// What its tasks have, limited or not.
+    pub used: Used,
+}
+
+/// What tasks have reserved, by resource.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "camelCase", default)]
+pub struct Used {
+    /// Cpu.
+    pub cpu: MilliCpu,
+    /// Memory.
+    pub memory: Bytes,
+    /// Leases of robots (AR).
     pub leases: u64,
+    /// Counted extras by name; those that are limited are named at 0 as well.
+    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
+    pub extended: BTreeMap<String, u64>,
 }
 
 fn rules(spec: &QuotaSpec, violations: &mut Violations) {

@@ -7,6 +7,15 @@ pub mod framework_session;
 
 pub use error::WireError;
 
+/// HTTP/2's windows for sessions, of a stream and of a connection, bytes: the longest message and one more behind it
+/// are under way without a word from the other side. With the usual 64 KiB to 1 MiB a long message stands still for a round
+/// trip for each window that it fills.
+pub const HTTP2_WINDOW: u32 = 8 << 20;
+/// Longest HTTP/2 frame that the ends of a session take, bytes. A message of 1 MiB is four of these, or 64 of the usual.
+pub const HTTP2_FRAME: u32 = 256 << 10;
+/// What one end of a session reads from its socket at once, bytes: TLS itself asks for 4 KiB at a time.
+pub const READ_BUFFER: usize = 64 << 10;
+
 /// Package `muster.framework`.
 pub mod framework {
     /// Messages of the session between a framework and the controller, with protobuf's JSON mapping.

@@ -106,6 +106,17 @@ impl Models {
     }
 }
 
+/// A task that runs others for its framework: it has registered with the agent of its node.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Executor {
+    /// The task.
+    pub uid: TaskUid,
+    /// Its name.
+    pub name: Box<str>,
+    /// Uid of the framework.
+    pub framework: Arc<str>,
+}
+
 /// One node: what it is, and what of it is taken.
 #[derive(Debug, Clone)]
 pub struct Member {
@@ -115,7 +126,9 @@ pub struct Member {
     pub facts: Option<NodeFacts>,
     /// Its books.
     pub ledger: NodeLedger,
-    /// Grows with every change of facts or books; a robot that only moves keeps it.
+    /// Executors that live there, as its agent last said.
+    pub executors: Vec<Executor>,
+    /// Grows with every change of facts, books or executors; a robot that only moves keeps it.
     pub version: u64,
     /// Grows with every change of facts alone.
     pub facts_version: u64,
@@ -159,6 +172,7 @@ impl Cluster {
             name: name.clone(),
             facts: None,
             ledger: NodeLedger::default(),
+            executors: Vec::new(),
             version: 0,
             facts_version: 0,
             in_order: None,
@@ -196,6 +210,16 @@ impl Cluster {
         let kind = facts.kind;
         self.moved.insert(slot);
         self.index_pose(slot, kind, Some(pose));
+    }
+
+    /// Takes in which executors live on a node.
+    pub fn set_executors(&mut self, name: &NodeName, executors: Vec<Executor>) {
+        let slot = self.slot(name);
+        let member = &mut self.members[slot as usize];
+        if member.executors != executors {
+            member.executors = executors;
+            self.touch(slot);
+        }
     }
 
     fn index_pose(&mut self, slot: Slot, kind: NodeKind, pose: Option<&Pose>) {
@@ -337,6 +361,7 @@ impl Cluster {
             uncount(&mut self.priorities, reservation.standing.priority);
         }
         member.ledger.release(uid);
+        member.executors.retain(|executor| executor.uid != *uid);
         let name = member.name.clone();
         self.touch(slot);
         Some(name)
@@ -367,6 +392,11 @@ impl Cluster {
     #[must_use]
     pub fn quota(&self, namespace: &str) -> Option<&QuotaSpec> {
         self.quotas.get(namespace)
+    }
+
+    /// Every quota, by namespace.
+    pub fn quotas(&self) -> impl Iterator<Item = (&Arc<str>, &QuotaSpec)> {
+        self.quotas.iter()
     }
 
     /// Whether any namespace has a quota.

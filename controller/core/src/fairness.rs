@@ -7,7 +7,7 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use muster_api::kind::quota::Limits;
+use muster_api::kind::quota::{Limits, QuotaSpec, QuotaStatus, Used};
 use muster_api::quantity::{Bytes, MilliCpu};
 use muster_api::resource::{Compute, Shortage};
 
@@ -108,6 +108,23 @@ impl Accounts {
         }
     }
 
+    /// What each Quota object is to show.
+    #[must_use]
+    pub fn of_quotas(&self, cluster: &Cluster) -> BTreeMap<Arc<str>, QuotaStatus> {
+        let status = |(namespace, quota): (&Arc<str>, &QuotaSpec)| {
+            let Account { compute, leases } = self.account(namespace);
+            let limited = quota.hard.extended.keys().map(|name| (name.clone(), 0));
+            let used = Used {
+                cpu: compute.cpu,
+                memory: compute.memory,
+                leases,
+                extended: limited.chain(compute.extended).collect(),
+            };
+            (Arc::clone(namespace), QuotaStatus { hard: quota.hard.clone(), used })
+        };
+        cluster.quotas().map(status).collect()
+    }
+
     /// What a namespace has.
     #[must_use]
     pub fn account(&self, namespace: &str) -> Account {
@@ -188,4 +205,41 @@ fn left(hard: &Limits, used: &Compute) -> Compute {
     };
     left.saturating_sub(used);
     left
+}
+
+#[cfg(test)]
+mod tests {
+    use muster_api::id::TaskUid;
+    use muster_api::kind::lease::DEFAULT_GROUP;
+    use muster_api::kind::node::NodeKind;
+
+    use super::*;
+    use crate::fixtures::{name, node};
+    use crate::ledger::Reservation;
+
+    #[test]
+    fn a_quota_shows_what_its_namespace_has_and_nothing_of_others() {
+        let mut cluster = Cluster::new();
+        cluster.upsert_node(&name("r"), &node(NodeKind::Robot, 2_000, None));
+        let extended = BTreeMap::from([("gpu".to_owned(), 1)]);
+        let hard = Limits { cpu: Some(MilliCpu(1_500)), extended, ..Limits::default() };
+        cluster.set_quota("lab", Some(QuotaSpec { hard: hard.clone(), weight: 1.0 }));
+        let reserve = |cluster: &mut Cluster, title: &str, groups: &[&str]| {
+            let compute = Compute::new(MilliCpu(500), Bytes(64));
+            let groups = groups.iter().map(|group| (*group).to_owned()).collect();
+            let reservation = Reservation { title: title.into(), compute, groups };
+            cluster.reserve(&TaskUid::new(title), 0, reservation).expect("there is room");
+        };
+        reserve(&mut cluster, "lab/driver", &[DEFAULT_GROUP]);
+        reserve(&mut cluster, "lab/other", &[]);
+        reserve(&mut cluster, "elsewhere/third", &[]);
+        let status = |cluster: &Cluster| Accounts::of(cluster).of_quotas(cluster);
+        let extended = BTreeMap::from([("gpu".to_owned(), 0)]);
+        let used = Used { cpu: MilliCpu(1_000), memory: Bytes(128), leases: 1, extended };
+        let expected = QuotaStatus { hard, used };
+        assert_eq!(status(&cluster), BTreeMap::from([("lab".into(), expected)]));
+        drop(cluster.release(&TaskUid::new("lab/driver")));
+        let used = &status(&cluster)["lab"].used;
+        assert_eq!((used.cpu, used.leases), (MilliCpu(500), 0));
+    }
 }

@@ -406,8 +406,8 @@ impl Desk {
             self.carry_out(cluster, verdicts).await;
         }
         for (seat, notice) in self.book.refresh(cluster, self.now()) {
-            if let Some(outlet) = self.guests.get(&seat).and_then(|g| g.outlet.as_ref()) {
-                tell(outlet, cluster, self.context.clock.now(), &notice);
+            if let Some(guest) = self.guests.get(&seat) {
+                tell(guest, cluster, self.context.clock.now(), &notice);
             }
         }
         self.book.next_deadline().map(|at| self.started + at)
@@ -477,6 +477,9 @@ impl Desk {
     }
 
     fn look(&self, cluster: &Cluster) -> Vec<View> {
+        if self.guests.is_empty() {
+            return Vec::new();
+        }
         let (accounts, now) = (Accounts::of(cluster), self.now());
         let offer_view = |seat: Seat, offer: &muster_controller_core::offer::Offer| {
             let member = cluster.at(offer.slot);
@@ -555,7 +558,8 @@ fn refuse(outlet: Option<&Outlet>, call: String, refusal: wire::Refusal) {
     answer(outlet, wire::Answer { id: call, refusal: Some(refusal), launched: Vec::new() });
 }
 
-fn tell(outlet: &Outlet, cluster: &Cluster, now: jiff::Timestamp, notice: &Notice) {
+fn tell(guest: &Guest, cluster: &Cluster, now: jiff::Timestamp, notice: &Notice) {
+    let Some(outlet) = &guest.outlet else { return };
     let mut ended: BTreeMap<_, Vec<String>> = BTreeMap::new();
     for (id, why) in &notice.rescinded {
         ended.entry(*why).or_default().push(id.to_string());
@@ -565,8 +569,8 @@ fn tell(outlet: &Outlet, cluster: &Cluster, now: jiff::Timestamp, notice: &Notic
         outlet.say(wire::event::Event::Rescind(wire::Rescind { offers, reason }));
     }
     if !notice.offered.is_empty() {
-        let offers =
-            notice.offered.iter().map(|o| convert::offer(cluster.at(o.slot), o, now)).collect();
+        let offer = |o| convert::offer((&guest.uid, o), cluster, now);
+        let offers = notice.offered.iter().map(offer).collect();
         outlet.say(wire::event::Event::Offers(wire::Offers { offers }));
     }
 }

@@ -4,18 +4,17 @@
 //! Also: a framework that is gone acknowledges nothing any more, so its tasks lose the finalizer that waits for it; and the
 //! numbers in Framework status are brought up to date here, a few seconds late.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::time::Duration;
 
-use muster_api::kind::framework::{ACKNOWLEDGE_FINALIZER, Framework};
-use muster_api::kind::task::Task;
+use muster_api::kind::framework::Framework;
 use tokio::time::{MissedTickBehavior, interval};
 
 use super::desk::View;
 use crate::context::Context;
-use crate::objects::{self, FRAMEWORKS, TASKS};
-use crate::session::frameworks::{Frameworks, let_go, owner_of, write_away};
+use crate::objects::{self, FRAMEWORKS};
+use crate::session::frameworks::{Frameworks, let_go, write_away};
 use crate::store::{Key, StoreError};
 
 /// How often everything is looked at. A failover timeout is exact to this; the numbers are as old as this.
@@ -25,47 +24,52 @@ const SHARE_STEP: f64 = 0.01;
 
 /// Works until dropped.
 pub async fn run(context: Arc<Context>, frameworks: Arc<Frameworks>) {
-    let mut known: BTreeMap<String, Key> = BTreeMap::new();
     let mut tick = interval(EVERY);
     tick.set_missed_tick_behavior(MissedTickBehavior::Delay);
     loop {
         tick.tick().await;
-        if let Err(error) = look(&context, &frameworks, &mut known).await {
+        if let Err(error) = look(&context, &frameworks).await {
             // The next look does it again.
             tracing::warn!(error = crate::app::chain(&error), "frameworks are not looked after");
         }
     }
 }
 
-async fn look(
-    context: &Context,
-    frameworks: &Frameworks,
-    known: &mut BTreeMap<String, Key>,
-) -> Result<(), StoreError> {
-    let mut present = BTreeMap::new();
-    let mut away = false;
+async fn look(context: &Context, frameworks: &Frameworks) -> Result<(), StoreError> {
+    // Before the objects: who is at the desk and has no object then has none any more.
+    let views = frameworks.look().await;
+    let mut present = BTreeSet::new();
     for stored in context.store.list(FRAMEWORKS, None).items {
         let Some(object) = objects::read::<Framework>(&stored) else { continue };
-        present.insert(stored.uid.to_string(), stored.key.clone());
-        if frameworks.is_connected(&stored.uid) {
-            continue;
+        present.insert(stored.uid.clone());
+        if !frameworks.is_connected(&stored.uid) {
+            consider_absent(context, &stored.key, &stored.uid, &object).await?;
         }
-        away = true;
-        consider_absent(context, &stored.key, &stored.uid, &object).await?;
     }
-    for (uid, key) in &*known {
-        if !present.contains_key(uid) {
+    let tasks = frameworks.roster().holding();
+    for view in &views {
+        let key = Key::namespaced(FRAMEWORKS, view.namespace.as_str(), view.name.as_str());
+        if present.contains(&*view.uid) {
+            let held = tasks.get(&view.uid).copied().unwrap_or_default();
+            write_view(context, &key, view, held).await?;
+        } else {
             tracing::info!(framework = %key, "framework is gone");
-            frameworks.cut(uid);
-            frameworks.remove(uid).await;
+            frameworks.cut(&view.uid);
+            frameworks.remove(&view.uid).await;
         }
     }
-    if *known != present || away {
-        let_orphans_go(context, &present.keys().map(String::as_str).collect()).await?;
+    let orphans = frameworks.roster().orphans(|uid| present.contains(uid));
+    if orphans.is_empty() {
+        return Ok(());
     }
-    *known = present;
-    if !known.is_empty() {
-        write_numbers(context, frameworks).await?;
+    // Looked at again after the tasks: a framework that came meanwhile may have launched some already.
+    let items = context.store.list(FRAMEWORKS, None).items;
+    let present: BTreeSet<&str> = items.iter().map(|stored| stored.uid.as_ref()).collect();
+    for (key, uid, framework) in orphans {
+        // Nobody is left to acknowledge its end.
+        if framework.is_none_or(|framework| !present.contains(&*framework)) {
+            let_go(&context.store, &key, &uid).await?;
+        }
     }
     Ok(())
 }
@@ -91,41 +95,6 @@ async fn consider_absent(
         {
             tracing::warn!(framework = %key, error = failure.message(), "a lost framework is not removed yet");
         }
-    }
-    Ok(())
-}
-
-/// Tasks whose framework is gone wait for nobody's acknowledgement.
-async fn let_orphans_go(context: &Context, frameworks: &BTreeSet<&str>) -> Result<(), StoreError> {
-    for stored in context.store.list(TASKS, None).items {
-        if !stored.mentions(ACKNOWLEDGE_FINALIZER) {
-            continue;
-        }
-        let Some(task) = objects::read::<Task>(&stored) else { continue };
-        let owner = owner_of(&task.metadata);
-        if owner.is_none_or(|uid| !frameworks.contains(&*uid)) {
-            let_go(&context.store, &stored.key, &stored.uid).await?;
-        }
-    }
-    Ok(())
-}
-
-async fn write_numbers(context: &Context, frameworks: &Frameworks) -> Result<(), StoreError> {
-    let mut tasks: BTreeMap<Arc<str>, u32> = BTreeMap::new();
-    for stored in context.store.list(TASKS, None).items {
-        if !stored.mentions(muster_api::kind::framework::FRAMEWORK_LABEL) {
-            continue;
-        }
-        let Some(task) = objects::read::<Task>(&stored) else { continue };
-        let holds = task.status.as_ref().is_some_and(|s| s.phase.holds_node());
-        if let (true, Some(owner)) = (holds, owner_of(&task.metadata)) {
-            *tasks.entry(owner).or_default() += 1;
-        }
-    }
-    for view in frameworks.look().await {
-        let key = Key::namespaced(FRAMEWORKS, view.namespace.as_str(), view.name.as_str());
-        let held = tasks.get(&view.uid).copied().unwrap_or_default();
-        write_view(context, &key, &view, held).await?;
     }
     Ok(())
 }

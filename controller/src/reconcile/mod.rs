@@ -8,6 +8,7 @@
 //! | [`desk`] | frameworks, in [`schedule`]'s own task | shows offers, takes Accepts |
 //! | [`failover`] | Frameworks | removes those that stay away, writes their numbers |
 //! | [`books`] | the scheduler's ledger | writes used, free and leases into Node status |
+//! | [`quotas`] | the scheduler's ledger | writes what namespaces have into Quota status |
 //! | [`health`] | heartbeats | marks silent nodes and their tasks |
 //! | [`deletion`] | Tasks being deleted | removes those whose processes are gone |
 //! | [`garbage`] | ownerReferences | deletes what lost its owner |
@@ -23,6 +24,7 @@ pub mod garbage;
 pub mod health;
 pub mod history;
 mod preempt;
+pub mod quotas;
 pub mod schedule;
 
 use std::sync::Arc;
@@ -49,7 +51,9 @@ pub struct Reconcilers {
 /// Starts every loop; each ends when `context.stop` is cancelled.
 pub fn spawn(context: &Arc<Context>, sessions: &Arc<Sessions>, tasks: &TaskTracker) -> Reconcilers {
     let books = Arc::new(books::Books::default());
-    let (scheduler, handle) = schedule::Scheduler::new(Arc::clone(context), Arc::clone(&books));
+    let counts = Arc::new(quotas::Counts::default());
+    let written = (Arc::clone(&books), Arc::clone(&counts));
+    let (scheduler, handle) = schedule::Scheduler::new(Arc::clone(context), written);
     let loops = context.stop.clone();
     let run = |name: &'static str, work: std::pin::Pin<Box<dyn Future<Output = ()> + Send>>| {
         let stop = loops.clone();
@@ -62,6 +66,7 @@ pub fn spawn(context: &Arc<Context>, sessions: &Arc<Sessions>, tasks: &TaskTrack
     };
     run("schedule", Box::pin(scheduler.run()));
     run("books", Box::pin(books::run(Arc::clone(context), books)));
+    run("quotas", Box::pin(quotas::run(Arc::clone(context), counts)));
     run("health", Box::pin(health::run(Arc::clone(context), Arc::clone(sessions))));
     run("deadline", Box::pin(deadline::run(Arc::clone(context))));
     run("deletion", Box::pin(deletion::run(Arc::clone(context))));

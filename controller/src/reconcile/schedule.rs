@@ -23,7 +23,7 @@ use muster_api::kind::task::{NodeRefusal, PREEMPTING, Task, TaskSpec, TaskStatus
 use muster_api::name::NodeName;
 use muster_api::phase::TaskPhase;
 use muster_api::pose::Pose;
-use muster_controller_core::cluster::Cluster;
+use muster_controller_core::cluster::{Cluster, Executor};
 use muster_controller_core::fairness::Accounts;
 use muster_controller_core::ledger::Reservation;
 use muster_controller_core::preempt::Preemption;
@@ -35,6 +35,7 @@ use tokio_util::task::AbortOnDropHandle;
 
 use super::books::{Books, Page};
 use super::desk::{self, Desk};
+use super::quotas::{Counter, Counts};
 use super::{RETRY, bind, next_events, preempt, watch_from_now};
 use crate::context::Context;
 use crate::objects::{self, LEASES, NODES, QUOTAS, TASKS};
@@ -64,6 +65,8 @@ enum Question {
     Why { demand: Demand, answer: oneshot::Sender<Vec<NodeRefusal>> },
     /// A robot is somewhere else.
     Pose { node: NodeName, pose: Pose },
+    /// Which executors live on a node.
+    Executors { node: NodeName, executors: Vec<Executor> },
     /// Something for the frameworks' desk.
     Desk(desk::Request),
 }
@@ -111,6 +114,16 @@ impl Handle {
         self.questions.send(Question::Desk(request)).await.map_err(|_| Ended)
     }
 
+    /// Says which executors live on a node: all of them.
+    ///
+    /// # Errors
+    ///
+    /// When the controller ends.
+    pub async fn executors(&self, node: NodeName, executors: Vec<Executor>) -> Result<(), Ended> {
+        let question = Question::Executors { node, executors };
+        self.questions.send(question).await.map_err(|_| Ended)
+    }
+
     /// Says where a robot is now. Lost when the scheduler is busy: the next pose comes soon.
     pub fn pose(&self, node: NodeName, pose: Pose) {
         // A full queue means poses come faster than they are taken in; newer ones follow.
@@ -133,6 +146,7 @@ struct Waiting {
 pub struct Scheduler {
     context: Arc<Context>,
     books: Arc<Books>,
+    counter: Counter,
     questions: mpsc::Receiver<Question>,
     cluster: Cluster,
     desk: Desk,
@@ -147,12 +161,16 @@ pub struct Scheduler {
 impl Scheduler {
     /// A scheduler that knows nothing yet, and the handle to ask it.
     #[must_use]
-    pub fn new(context: Arc<Context>, books: Arc<Books>) -> (Self, Handle) {
+    pub fn new(
+        context: Arc<Context>,
+        (books, counts): (Arc<Books>, Arc<Counts>),
+    ) -> (Self, Handle) {
         let (sender, questions) = mpsc::channel(QUESTIONS);
         let scheduler = Scheduler {
             desk: Desk::new(Arc::clone(&context)),
             context,
             books,
+            counter: Counter::new(counts),
             questions,
             cluster: Cluster::new(),
             waiting: HashMap::new(),
@@ -191,7 +209,7 @@ impl Scheduler {
     /// Looks at everything.
     async fn rebuild(&mut self) -> Watcher {
         let watcher = watch_from_now(&self.context.store).await;
-        self.cluster = Cluster::new();
+        let old = std::mem::take(&mut self.cluster);
         self.desk.begin_anew();
         self.waiting.clear();
         self.own.clear();
@@ -208,6 +226,10 @@ impl Scheduler {
         });
         for stored in tasks {
             self.take_in(TASKS, Change::Put, &stored);
+        }
+        // Agents say it once a session, and not to the store.
+        for member in old.all().filter(|member| !member.executors.is_empty()) {
+            self.cluster.set_executors(&member.name, member.executors.clone());
         }
         tracing::info!(
             nodes = self.cluster.members().count(),
@@ -244,6 +266,7 @@ impl Scheduler {
             let Some(lease) = objects::read::<Lease>(stored) else { return };
             let Ok(node) = NodeName::new(lease.spec.node.clone()) else { return };
             let status = lease.status.unwrap_or_default();
+            self.counter.changed();
             self.cluster.set_lease(
                 &node,
                 &lease.spec.group,
@@ -256,8 +279,14 @@ impl Scheduler {
     fn take_in_quota(&mut self, change: Change, stored: &Arc<Stored>) {
         let namespace = stored.key.namespace().unwrap_or_default();
         let quota = (change == Change::Put).then(|| objects::read::<Quota>(stored)).flatten();
-        self.cluster.set_quota(namespace, quota.map(|q| q.spec));
-        self.desk.quotas_changed();
+        // Somebody may have written another status.
+        self.counter.changed();
+        let spec = quota.map(|q| q.spec);
+        // Most changes are the writing of what the namespace has.
+        if self.cluster.quota(namespace) != spec.as_ref() {
+            self.cluster.set_quota(namespace, spec);
+            self.desk.quotas_changed();
+        }
     }
 
     fn quota_reason(&self, demand: &Demand) -> Option<NodeRefusal> {
@@ -364,6 +393,9 @@ impl Scheduler {
                 drop(answer.send(quota.into_iter().chain(nodes).collect()));
             }
             Question::Pose { node, pose } => self.cluster.set_pose(&node, &pose),
+            Question::Executors { node, executors } => {
+                self.cluster.set_executors(&node, executors);
+            }
             Question::Desk(request) => self.desk.take(&mut self.cluster, request),
         }
     }
@@ -382,7 +414,11 @@ impl Scheduler {
             retry = [binds, preempted, waits].into_iter().flatten().min();
         }
         let desk = self.desk.work(&mut self.cluster).await;
-        let retry = [retry, desk].into_iter().flatten().min();
+        if !self.dirty.is_empty() {
+            self.counter.changed();
+        }
+        let count = self.counter.work(&self.cluster);
+        let retry = [retry, desk, count].into_iter().flatten().min();
         for node in std::mem::take(&mut self.dirty) {
             if let Some(member) = self.cluster.member(&node) {
                 self.books.put(&node, Page::from(&member.ledger));

@@ -286,6 +286,7 @@ impl Session {
                 }
                 Ok(())
             }
+            Some(FromAgent::Executors(executors)) => self.take_executors(&executors.tasks).await,
             Some(FromAgent::Hello(_)) => Err(Status::invalid_argument("a second Hello").into()),
             None => Err(Status::invalid_argument("a message without a body").into()),
         }
@@ -322,6 +323,14 @@ impl Session {
         let usage = NodeUsage { node: heartbeat.node.unwrap_or_default(), tasks: heartbeat.usage };
         self.sessions.set_usage(&self.node, usage);
         self.send(ToAgent::Heartbeat(wire::HeartbeatAck { sequence: heartbeat.sequence })).await
+    }
+
+    async fn take_executors(&mut self, uids: &[String]) -> Result<(), End> {
+        self.is_newest()?;
+        let Some(live) = self.context.live() else { return Ok(()) };
+        let executors = live.frameworks.executors_on(&self.node, uids);
+        // The scheduler ends only with the controller.
+        self.scheduler.executors(self.node.clone(), executors).await.map_err(|_| End::Closed)
     }
 
     pub(super) async fn acknowledge(&self, report: &wire::TaskReport) -> Result<(), End> {

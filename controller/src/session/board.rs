@@ -167,6 +167,8 @@ fn assignment(task: &Task) -> wire::Assignment {
         lease: lease_token(&status),
         stop,
         ended: status.phase.is_terminal(),
+        framework: super::frameworks::owning(&task.metadata)
+            .map(|o| wire::Framework { id: o.uid.clone(), name: o.name.clone() }),
     }
 }
 

@@ -7,6 +7,7 @@
 mod floor;
 mod footprint;
 mod list;
+mod messages;
 mod placement;
 mod stats;
 mod submit;
@@ -30,6 +31,9 @@ const FIGURES: &[Figure] = &[
     }),
     ("container", "submit to Running of a container, against raw create+start", || {
         Box::pin(submit::container())
+    }),
+    ("messages", "framework to executor and back, against a TCP echo on loopback", || {
+        Box::pin(messages::round_trip())
     }),
     ("list", "list of 10 000 nodes, against encoding it and a loopback write", || {
         Box::pin(list::nodes())

@@ -3,8 +3,11 @@
 use std::path::Path;
 use std::process::{Command, Output};
 
+use kube::Api;
+use muster_api::kind::quota::Quota;
 use muster_api::phase::TaskPhase;
-use muster_tests::{AgentOptions, Cluster, cluster::binary};
+use muster_tests::{AgentOptions, Cluster, cluster::binary, wait};
+use serde_json::json;
 
 fn manifests() -> std::path::PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../manifests")
@@ -117,4 +120,41 @@ async fn a_controller_that_is_not_there_is_said_with_the_next_step() {
     let (code, out, err) = muster(&cluster, &["get", "nodes"]);
     assert_eq!((code, out.as_str()), (6, ""), "{err}");
     assert!(err.contains("https://127.0.0.1:") && err.contains("kubeconfig"), "{err}");
+}
+
+/// What a namespace has stands beside what it may have, for declared tasks as they come and go.
+#[tokio::test(flavor = "multi_thread")]
+async fn a_quota_says_what_is_used() {
+    let mut cluster = Cluster::start().await;
+    cluster.join(AgentOptions::robot("robot", 0.0, 0.0)).await;
+    let quota = json!({
+        "apiVersion": muster_api::API_VERSION, "kind": "Quota", "metadata": {"name": "default"},
+        "spec": {"hard": {"cpu": "1500m", "leases": 2}},
+    });
+    let path = "/apis/muster.dev/v1alpha1/namespaces/default/quotas";
+    cluster.post(path, &quota).await;
+    let is = |cpu: u64, leases: u64| {
+        let has = move |quota: Option<&Quota>| {
+            let used = quota.and_then(|q| q.status.as_ref()).map(|status| status.used.clone());
+            used.is_some_and(|used| (used.cpu.0, used.leases) == (cpu, leases))
+        };
+        let cluster = &cluster;
+        async move {
+            let api = Api::<Quota>::namespaced(cluster.client().await, "default");
+            wait::object(api, "default", &format!("{cpu} cpu, {leases} leases"), has).await
+        }
+    };
+    is(0, 0).await;
+    let resources = json!({"cpu": "300m", "memory": "64Mi", "actuators": ["base:Drive"]});
+    let run = json!({"process": {"command": ["sleep", "1000"]}});
+    let spec = json!({"resources": resources, "run": run, "gracePeriodSeconds": 0});
+    cluster.create("driver", spec).await;
+    let status = is(300, 1).await.and_then(|quota| quota.status).expect("it has one");
+    assert_eq!(status.hard.leases, Some(2));
+    let (_, table, _) = muster(&cluster, &["get", "quotas"]);
+    for cell in ["0.3/1.5", "64Mi/-", "1/2"] {
+        assert!(table.contains(cell), "{cell} is not in\n{table}");
+    }
+    cluster.delete("driver").await;
+    is(0, 0).await;
 }

@@ -172,7 +172,8 @@ async fn an_executor_runs_tasks_and_talks_to_its_framework() {
     });
     let launched = framework.launch(&[("slave-1", "worker", executor)]).await;
     assert_eq!(launched["event"], "launched", "{launched}");
-    let ready = framework.event("ready", |e| e["event"] == "message" && e["data"] == "ready").await;
+    let word = format!("ready crew {}", framework.id);
+    let ready = framework.event("ready", |e| e["event"] == "message" && e["data"] == *word).await;
     assert_eq!(ready["executor"], launched["tasks"]["worker"]);
     assert_eq!(ready["node"], "slave-1");
 
@@ -182,7 +183,15 @@ async fn an_executor_runs_tasks_and_talks_to_its_framework() {
     });
     let elsewhere = framework.launch(&[("slave-2", "lost", work.clone())]).await;
     assert_eq!(elsewhere["reason"], "CONFLICT", "its executor is not there: {elsewhere}");
-    framework.holds("what is left", |o| cpu(o, "slave-1") == Some(800)).await;
+    let known = |o: &BTreeMap<String, Value>| o.get("slave-1").map(|o| o["executors"].clone());
+    let there = json!({"worker": ready["executor"]});
+    framework
+        .holds("what is left", |o| {
+            cpu(o, "slave-1") == Some(800) && known(o).as_ref() == Some(&there)
+        })
+        .await;
+    let stranger = Puppet::start(&cluster, json!({"name": "stranger"})).await;
+    assert_eq!(known(&holding(stranger).await), Some(json!({})), "it is not the stranger's");
     let launched = framework.launch(&[("slave-1", "work-1", work.clone())]).await;
     assert_eq!(launched["event"], "launched", "{launched}");
     framework.hears("work-1", "RUNNING").await;
@@ -205,7 +214,14 @@ async fn an_executor_runs_tasks_and_talks_to_its_framework() {
         .event("the end of work-2", |e| e["name"] == "work-2" && e["state"] == "FAILED")
         .await;
     assert_eq!(end["reason"], "ExecutorLost");
+    framework.holds("no executor", |o| known(o) == Some(json!({}))).await;
     framework.holds("the actuators at last", |o| list(o, "slave-1", "actuators") == 2).await;
+}
+
+/// What a framework is offered first.
+async fn holding(mut framework: Puppet) -> BTreeMap<String, Value> {
+    framework.holds("offers", |o| o.len() == 2).await;
+    framework.holding
 }
 
 /// A framework that does not answer (SIGSTOP) holds offers of everything and holds nobody up; when it goes on, it is told what

@@ -2,6 +2,7 @@
 
 mod cli;
 mod demo;
+mod examples;
 mod fence;
 mod figure4;
 mod frameworks;

@@ -30,6 +30,7 @@ use bollard::query_parameters::{
 use bytes::Bytes;
 use futures::future::{BoxFuture, FutureExt};
 use futures::stream::{BoxStream, StreamExt, TryStreamExt};
+use muster_agent_core::desired::StopTimes;
 use muster_agent_core::observed::{End, Exit, Loss, Observed, Started};
 use muster_agent_core::workload::Failure;
 use muster_api::id::TaskUid;
@@ -306,8 +307,11 @@ impl DockerRuntime {
         }
     }
 
-    async fn stop(&self, id: &AttemptId, grace: Duration) -> Result<(), RuntimeError> {
+    async fn stop(&self, id: &AttemptId, times: StopTimes) -> Result<(), RuntimeError> {
         let docker = self.client()?;
+        // With the agent goes this wait; the next one asks its executor anew.
+        tokio::time::sleep(Duration::from_millis(times.signal_ms)).await;
+        let grace = Duration::from_millis(times.kill_ms.saturating_sub(times.signal_ms));
         if grace < Duration::from_secs(1) {
             // The engine knows whole seconds only: a fraction of one is none.
             return self.kill(&docker, id).await;
@@ -422,9 +426,9 @@ impl Runtime for DockerRuntime {
     fn stop<'a>(
         &'a self,
         id: &'a AttemptId,
-        grace: Duration,
+        times: StopTimes,
     ) -> BoxFuture<'a, Result<(), RuntimeError>> {
-        self.stop(id, grace).boxed()
+        self.stop(id, times).boxed()
     }
 
     fn resize<'a>(

@@ -92,6 +92,9 @@ pub(crate) struct Process {
 #[serde(rename_all = "camelCase")]
 pub(crate) struct StopFile {
     pub(crate) grace_ms: u64,
+    /// Until SIGTERM.
+    #[serde(default)]
+    pub(crate) signal_ms: u64,
 }
 
 /// One attempt's directory.

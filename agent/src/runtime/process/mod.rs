@@ -35,6 +35,7 @@ use bytes::Bytes;
 use futures::FutureExt;
 use futures::future::BoxFuture;
 use futures::stream::BoxStream;
+use muster_agent_core::desired::StopTimes;
 use muster_agent_core::observed::{End, Exit, Loss, Observed, Started};
 use muster_agent_core::workload::Failure;
 use muster_api::id::TaskUid;
@@ -258,7 +259,7 @@ impl ProcessRuntime {
             _ => Reach::Tree { shim, session, mark: reach::mark(id) },
         };
         let mut ladder = Ladder::Idle;
-        ladder.stop(&reach, Duration::from_millis(launch.grace_ms));
+        ladder.stop(StopTimes { signal_ms: 0, kill_ms: launch.grace_ms });
         while !reach.is_empty() {
             let pause = ladder.step(&reach).unwrap_or_default();
             // A program that obeys ends long before its grace does.
@@ -285,11 +286,11 @@ impl ProcessRuntime {
         }
     }
 
-    fn stop(&self, id: &AttemptId, grace: Duration) -> Result<(), RuntimeError> {
+    fn stop(&self, id: &AttemptId, times: StopTimes) -> Result<(), RuntimeError> {
         let what = "order a shim to end its attempt";
         let dir = self.0.dir(id);
-        let grace_ms = u64::try_from(grace.as_millis()).unwrap_or(u64::MAX);
-        dir.write_stop(StopFile { grace_ms }).map_err(|e| RuntimeError::new(what, e))?;
+        let StopTimes { signal_ms, kill_ms: grace_ms } = times;
+        dir.write_stop(StopFile { grace_ms, signal_ms }).map_err(|e| RuntimeError::new(what, e))?;
         let Some(live) = self.live(id) else { return Ok(()) };
         match rustix::process::pidfd_send_signal(&*live.shim, Signal::USR1) {
             // Gone: whoever waits for it ends what is left.
@@ -381,9 +382,9 @@ impl Runtime for ProcessRuntime {
     fn stop<'a>(
         &'a self,
         id: &'a AttemptId,
-        grace: Duration,
+        times: StopTimes,
     ) -> BoxFuture<'a, Result<(), RuntimeError>> {
-        async move { self.stop(id, grace) }.boxed()
+        async move { self.stop(id, times) }.boxed()
     }
 
     fn resize<'a>(

@@ -3,6 +3,8 @@
 use std::collections::BTreeSet;
 use std::time::{Duration, Instant};
 
+use muster_agent_core::desired::StopTimes;
+
 use super::scan;
 use crate::runtime::cgroup::group::Group;
 use crate::runtime::launch::{AttemptId, Used};
@@ -75,6 +77,8 @@ impl Reach {
 pub(crate) enum Ladder {
     /// Nobody asked for an end.
     Idle,
+    /// It may end by itself until SIGTERM is due.
+    Asked { signal: Instant, until: Instant },
     /// SIGTERM was sent; SIGKILL follows at the deadline.
     Terminating { until: Instant },
     /// SIGKILL until nothing is left.
@@ -86,16 +90,24 @@ pub(crate) enum Ladder {
 const KILL_PAUSE: (Duration, Duration) = (Duration::from_millis(1), Duration::from_millis(200));
 
 impl Ladder {
-    /// SIGTERM now, SIGKILL after `grace`; a later call can only bring the deadline nearer.
-    pub(crate) fn stop(&mut self, reach: &Reach, grace: Duration) {
-        let wanted = Instant::now() + grace;
+    /// A later call can only bring the deadlines nearer. [`Ladder::step`] does what is due.
+    pub(crate) fn stop(&mut self, times: StopTimes) {
+        let after = |ms| Instant::now() + Duration::from_millis(ms);
+        let (term, kill) = (after(times.signal_ms), after(times.kill_ms));
         match self {
-            Ladder::Idle => {
-                reach.terminate();
-                *self = Ladder::Terminating { until: wanted };
+            Ladder::Idle => *self = Ladder::Asked { signal: term, until: kill },
+            Ladder::Asked { signal, until } => {
+                (*signal, *until) = ((*signal).min(term), (*until).min(kill));
             }
-            Ladder::Terminating { until } => *until = (*until).min(wanted),
+            Ladder::Terminating { until } => *until = (*until).min(kill),
             Ladder::Killing { .. } => {}
+        }
+    }
+
+    /// Nobody is left who could end by itself: SIGTERM is due.
+    pub(crate) fn signal_now(&mut self) {
+        if let Ladder::Asked { signal, .. } = self {
+            *signal = Instant::now();
         }
     }
 
@@ -108,6 +120,14 @@ impl Ladder {
 
     /// Does what is due. Returns how long nothing more will be.
     pub(crate) fn step(&mut self, reach: &Reach) -> Option<Duration> {
+        if let Ladder::Asked { signal, until } = *self {
+            let left = signal.saturating_duration_since(Instant::now());
+            if !left.is_zero() {
+                return Some(left);
+            }
+            reach.terminate();
+            *self = Ladder::Terminating { until };
+        }
         if let Ladder::Terminating { until } = *self {
             let left = until.saturating_duration_since(Instant::now());
             if !left.is_zero() {

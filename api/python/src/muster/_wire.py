@@ -22,6 +22,7 @@ from muster.model import (
     LaunchResult,
     NodeKind,
     Offer,
+    OfferedExecutor,
     Pose,
     Position,
     RescindReason,
@@ -128,7 +129,7 @@ def offer(value: pb.Offer) -> Offer:
         sensors=tuple(value.sensors),
         actuators=tuple(value.actuators),
         runtimes=tuple(value.runtimes),
-        executors=tuple(value.executors),
+        executors=tuple(OfferedExecutor(one.task, one.name) for one in value.executors),
         made_at=_time(value.made_at) if value.HasField("made_at") else None,
     )
 

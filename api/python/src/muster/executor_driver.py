@@ -134,7 +134,9 @@ class ExecutorDriver(Life):
             self.stop()
 
     def _registered(self, answer: pb.Registered) -> None:
-        info = ExecutorInfo(answer.executor, answer.namespace, answer.framework, answer.node)
+        info = ExecutorInfo(
+            answer.executor, answer.namespace, answer.framework, answer.node, answer.framework_id
+        )
         if answer.reregistered:
             self._executor.reregistered(self, info)
         else:

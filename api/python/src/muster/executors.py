@@ -37,6 +37,8 @@ class ExecutorInfo:
     #: Empty: a declared task.
     framework: str
     node: str
+    #: The framework's id; empty as well.
+    framework_id: str = ""
 
 
 @dataclass(frozen=True)
@@ -105,7 +107,10 @@ class Executor:
         """The framework says something. At most once, in order."""
 
     def shutdown(self, driver: ExecutorDriver, grace_seconds: float) -> None:
-        """End every task; the driver ends when this returns and the agent has the last updates."""
+        """End every task; the driver ends when this returns and the agent has the last updates.
+
+        The program should exit then: half way through the grace the agent sends SIGTERM, and at its end SIGKILL.
+        """
 
     def error(self, driver: ExecutorDriver, message: str) -> None:
         """The agent does not speak our protocol; the driver ends."""

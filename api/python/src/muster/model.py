@@ -155,6 +155,14 @@ class FrameworkInfo:
 
 
 @dataclass(frozen=True)
+class OfferedExecutor:
+    """An executor that has registered, and takes tasks: ``muster.executor(name, …)`` is work for it."""
+
+    task_id: str
+    name: str
+
+
+@dataclass(frozen=True)
 class Offer:
     """What one node could give now. Others may hold an offer of the same."""
 
@@ -171,8 +179,8 @@ class Offer:
     #: AR functions; empty while they are held.
     actuators: tuple[str, ...]
     runtimes: tuple[str, ...]
-    #: uids of this framework's executors there.
-    executors: tuple[str, ...]
+    #: This framework's executors there.
+    executors: tuple[OfferedExecutor, ...]
     made_at: Optional[datetime] = None
 
 

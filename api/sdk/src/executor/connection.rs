@@ -216,8 +216,9 @@ impl Connection {
         if std::mem::replace(&mut self.registered, true) {
             return Event::Reregistered;
         }
-        let proto::Registered { executor, namespace, framework, node, .. } = registered;
-        Event::Registered(Registration { executor, namespace, framework, node })
+        let proto::Registered { executor, namespace, framework, framework_id, node, .. } =
+            registered;
+        Event::Registered(Registration { executor, namespace, framework, framework_id, node })
     }
 
     async fn command(&mut self, command: Command, writer: &mut OwnedWriteHalf) -> io::Result<()> {

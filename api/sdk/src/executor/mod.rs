@@ -52,6 +52,8 @@ pub struct Registration {
     pub namespace: String,
     /// The framework's name; empty: the executor is a declared task.
     pub framework: String,
+    /// The framework's id; empty as well.
+    pub framework_id: String,
     /// The node.
     pub node: String,
 }
@@ -115,7 +117,8 @@ pub trait Executor: Send {
         async {}
     }
 
-    /// End every task within `grace`. The driver returns after this, once the agent has the updates.
+    /// End every task within `grace`. The driver returns after this, once the agent has the updates; the program should
+    /// exit then: half way through the grace the agent sends SIGTERM, and at its end SIGKILL.
     fn shutdown(
         &mut self,
         _handle: &ExecutorHandle,

@@ -4,10 +4,12 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use hyper_util::rt::TokioIo;
+use muster_api::wire::{HTTP2_FRAME, HTTP2_WINDOW, READ_BUFFER};
 use rustls::crypto::ring;
 use rustls::pki_types::pem::PemObject as _;
 use rustls::pki_types::{CertificateDer, PrivateKeyDer, ServerName};
 use rustls::{CertificateError, ClientConfig, Error, RootCertStore};
+use tokio::io::BufReader;
 use tokio::net::TcpStream;
 use tokio_rustls::TlsConnector;
 use tokio_rustls::client::TlsStream;
@@ -41,7 +43,11 @@ pub(crate) async fn dial(
     address: &Address,
     tls: &Arc<ClientConfig>,
 ) -> Result<Channel, tonic::transport::Error> {
-    let endpoint = Endpoint::from_shared(format!("http://{address}"))?.connect_timeout(PATIENCE);
+    let endpoint = Endpoint::from_shared(format!("http://{address}"))?
+        .connect_timeout(PATIENCE)
+        .initial_stream_window_size(HTTP2_WINDOW)
+        .initial_connection_window_size(HTTP2_WINDOW)
+        .max_frame_size(HTTP2_FRAME);
     let (address, tls) = (address.clone(), Arc::clone(tls));
     let connector = tower::service_fn(move |_: http::Uri| {
         let (address, tls) = (address.clone(), Arc::clone(&tls));
@@ -53,10 +59,10 @@ pub(crate) async fn dial(
 async fn connect(
     address: &Address,
     tls: Arc<ClientConfig>,
-) -> std::io::Result<TlsStream<TcpStream>> {
+) -> std::io::Result<TlsStream<BufReader<TcpStream>>> {
     let host = ServerName::try_from(address.host.clone()).map_err(std::io::Error::other)?;
     let tcp = TcpStream::connect((address.host.as_str(), address.port)).await?;
     // Calls are small, and somebody waits for each. Without it they are only slower.
     let _ = tcp.set_nodelay(true);
-    TlsConnector::from(tls).connect(host, tcp).await
+    TlsConnector::from(tls).connect(host, BufReader::with_capacity(READ_BUFFER, tcp)).await
 }

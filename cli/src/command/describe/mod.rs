@@ -97,9 +97,7 @@ async fn describe(
         }
         "Quota" => {
             let quota: Quota = serde_json::from_value(object).map_err(read)?;
-            let namespace = quota.metadata.namespace.as_deref();
-            let tasks = holding(namespace, Selection::default(), session).await?;
-            quota::describe(&mut sheet, &quota, &tasks, now);
+            quota::describe(&mut sheet, &quota, now);
         }
         "Task" => task::describe(&mut sheet, &serde_json::from_value(object).map_err(read)?, now),
         "Lease" => lease::describe(&mut sheet, &serde_json::from_value(object).map_err(read)?, now),
@@ -342,15 +340,9 @@ mod tests {
                 "apiVersion": "muster.dev/v1alpha1", "kind": "Quota",
                 "metadata": {"name": "default", "namespace": "default"},
                 "spec": {"hard": {"cpu": "4", "leases": 2, "extended": {"gpu": 1}}, "weight": 2},
+                "status": {"used": {"cpu": "500m", "memory": "64Mi", "leases": 1}},
             }),
         );
-        let lease = json!({"name": "r1.body", "epoch": 3});
-        let mut driver = task("a", json!({"phase": "Running", "node": "r1", "lease": lease}));
-        driver["spec"]["resources"] = json!({"cpu": "500m", "memory": "64Mi"});
-        fake.put("tasks/default/a", driver.clone());
-        // What has ended holds nothing.
-        driver["status"]["phase"] = "Succeeded".into();
-        fake.put("tasks/default/b", driver);
         let (_, text) = fake.run(&["describe", "quota", "default"]).await;
         for line in [
             "Weight:          2",

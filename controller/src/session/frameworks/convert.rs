@@ -7,13 +7,18 @@ use muster_api::phase::TaskPhase;
 use muster_api::validate::Violations;
 use muster_api::wire::framework::v1 as wire;
 use muster_api::wire::framework_session::{compute_to_wire, pose_to_wire, time_to_wire};
-use muster_controller_core::cluster::Member;
+use muster_controller_core::cluster::Cluster;
 use muster_controller_core::offer::allocator::actuators_free;
 use muster_controller_core::offer::settle::Denied;
 use muster_controller_core::offer::{Offer, Rescinded};
 
-/// An offer with what the node has now.
-pub(crate) fn offer(member: &Member, offer: &Offer, now: Timestamp) -> wire::Offer {
+/// An offer to a framework, with what the node has now.
+pub(crate) fn offer(
+    (framework, offer): (&str, &Offer),
+    cluster: &Cluster,
+    now: Timestamp,
+) -> wire::Offer {
+    let member = cluster.at(offer.slot);
     let facts = member.facts.as_ref();
     let names = |functions: Option<Vec<String>>| functions.unwrap_or_default();
     wire::Offer {
@@ -40,7 +45,12 @@ pub(crate) fn offer(member: &Member, offer: &Offer, now: Timestamp) -> wire::Off
                 f.runtimes.iter().filter(|r| r.available).map(|r| r.name.clone()).collect()
             }),
         ),
-        executors: Vec::new(),
+        executors: member
+            .executors
+            .iter()
+            .filter(|executor| *executor.framework == *framework)
+            .map(|e| wire::Executor { task: e.uid.to_string(), name: e.name.to_string() })
+            .collect(),
         made_at: Some(time_to_wire(now)),
     }
 }

@@ -12,6 +12,7 @@
 //! | `session` | one framework's session, whatever carries it |
 //! | `subscribe` | the first call: who it is, and its Framework object |
 //! | `launch` | the launches of an Accept → checked Task objects |
+//! | `roster` | the tasks of all frameworks |
 //! | [`updates`] | states of tasks → the mailboxes of their frameworks |
 //! | [`service`], [`lines`] | the two transports |
 //! | `convert` | what is said, as messages |
@@ -19,24 +20,27 @@
 pub(crate) mod convert;
 mod launch;
 pub mod lines;
+mod roster;
 pub mod service;
 mod session;
 mod subscribe;
 pub mod updates;
 
 pub(crate) use session::let_go;
-pub(crate) use subscribe::{owner_of, write_away};
+pub(crate) use subscribe::{owner_of, owning, write_away};
 
 use std::collections::{BTreeMap, HashMap};
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
+use muster_api::id::TaskUid;
 use muster_api::kind::task::Task;
 use muster_api::name::NodeName;
 use muster_api::wire::agent::v1::controller_message::Body as ToAgent;
 use muster_api::wire::agent::v1::{ControllerMessage, Message as AgentMessage};
 use muster_api::wire::framework::v1 as wire;
+use muster_controller_core::cluster::Executor;
 use tokio::sync::{Notify, mpsc, oneshot};
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
@@ -108,8 +112,9 @@ pub struct Frameworks {
     /// Sessions by the id that their frameworks were told.
     by_session: Mutex<HashMap<String, FrameworkUid>>,
     next_session: AtomicU64,
-    /// Tasks that spoke as executors, and the frameworks that they belong to.
+    /// Tasks that registered or spoke as executors, and the frameworks that they belong to.
     executors: Mutex<HashMap<String, FrameworkUid>>,
+    roster: roster::Roster,
 }
 
 impl Frameworks {
@@ -130,11 +135,16 @@ impl Frameworks {
             by_session: Mutex::default(),
             next_session: AtomicU64::new(1),
             executors: Mutex::default(),
+            roster: roster::Roster::default(),
         }
     }
 
     fn session_number(&self) -> u64 {
         self.next_session.fetch_add(1, Ordering::Relaxed)
+    }
+
+    pub(crate) fn roster(&self) -> &roster::Roster {
+        &self.roster
     }
 
     /// Whether the framework has a session.
@@ -216,6 +226,16 @@ impl Frameworks {
         let AgentMessage { executor, data } = message;
         let message = wire::Message { executor, node: node.to_string(), data };
         self.say(&owner, wire::event::Event::Message(message));
+    }
+
+    /// Those of a node's executors that are a framework's.
+    pub(crate) fn executors_on(&self, node: &NodeName, uids: &[String]) -> Vec<Executor> {
+        let executor = |uid: &String| {
+            let framework = self.owner_of_executor(node, uid)?;
+            let (_, key) = self.agents.board().find(uid)?;
+            Some(Executor { uid: TaskUid::new(uid.as_str()), name: (*key.name).into(), framework })
+        };
+        uids.iter().filter_map(executor).collect()
     }
 
     /// The framework of a task on this node; remembered, so that a stream of messages reads no objects.

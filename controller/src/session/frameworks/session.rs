@@ -346,6 +346,17 @@ impl Session {
 
     /// The key of one of the framework's tasks.
     fn find(&self, uid: &str) -> Option<Key> {
+        let placed = self.frameworks.agents.board().find(uid).and_then(|(_, key)| {
+            let stored = self.frameworks.context.store.get(&key)?;
+            let task = (*stored.uid == *uid).then(|| objects::read::<Task>(&stored)).flatten()?;
+            subscribe::owner_of(&task.metadata).filter(|owner| *owner == self.guest.uid)?;
+            Some(key)
+        });
+        // The board is a moment behind: one that was just launched may not be on it yet.
+        placed.or_else(|| self.look_for(uid))
+    }
+
+    fn look_for(&self, uid: &str) -> Option<Key> {
         let tasks = self.tasks();
         let found = tasks.iter().find(|(_, t)| objects::uid_of(&t.metadata) == uid);
         found.map(|(_, task)| objects::task_key(task))

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use k8s_openapi::apimachinery::pkg::apis::meta::v1::MicroTime;
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::{MicroTime, ObjectMeta, OwnerReference};
 use muster_api::kind::framework::{Framework, FrameworkSpec};
 use muster_api::kind::namespace::DEFAULT;
 use muster_api::name::check_name;
@@ -200,10 +200,12 @@ pub(super) fn owner(key: &Key, uid: &FrameworkUid) -> serde_json::Value {
     })
 }
 
-/// The uid of the framework that owns an object.
-pub(crate) fn owner_of(
-    metadata: &k8s_openapi::apimachinery::pkg::apis::meta::v1::ObjectMeta,
-) -> Option<Arc<str>> {
-    let owners = metadata.owner_references.iter().flatten();
-    owners.into_iter().find(|o| o.kind == "Framework").map(|o| o.uid.as_str().into())
+/// The framework that owns an object.
+pub(crate) fn owning(metadata: &ObjectMeta) -> Option<&OwnerReference> {
+    metadata.owner_references.iter().flatten().find(|o| o.kind == "Framework")
+}
+
+/// Its uid.
+pub(crate) fn owner_of(metadata: &ObjectMeta) -> Option<Arc<str>> {
+    owning(metadata).map(|o| o.uid.as_str().into())
 }

@@ -1,11 +1,12 @@
-//! States of tasks → the mailboxes of their frameworks; lost nodes and executors → everybody whom they concern.
+//! States of tasks → the mailboxes of their frameworks, and the roster; lost nodes and executors → everybody whom they concern.
 //!
 //! One loop for all frameworks: it reads each change of a framework's task once. What a framework misses while it is away
 //! is told when it comes back, from the objects.
 
+use std::collections::HashSet;
 use std::sync::Arc;
 
-use muster_api::kind::framework::FRAMEWORK_LABEL;
+use muster_api::kind::framework::{ACKNOWLEDGE_FINALIZER, FRAMEWORK_LABEL};
 use muster_api::kind::task::Task;
 use muster_api::phase::TaskPhase;
 use muster_api::wire::framework::v1 as wire;
@@ -24,8 +25,11 @@ pub async fn run(context: Arc<Context>, frameworks: Arc<Frameworks>) {
     loop {
         let mut watcher = watch_from_now(&context.store).await;
         // After having fallen behind: the present state of everything makes up for what was missed.
-        for stored in context.store.list(TASKS, None).items {
-            tell(&frameworks, &stored, Change::Put);
+        let snapshot = context.store.list(TASKS, None).items;
+        let there: HashSet<&str> = snapshot.iter().map(|stored| stored.uid.as_ref()).collect();
+        frameworks.roster().keep_only(|uid| there.contains(uid));
+        for stored in &snapshot {
+            tell(&frameworks, stored, Change::Put);
         }
         while let Some(events) = next_events(&mut watcher).await {
             for event in events.iter().filter(|e| e.object.key.resource == NODES) {
@@ -55,10 +59,16 @@ fn tell_of_node(frameworks: &Frameworks, event: &Event) {
 }
 
 fn tell(frameworks: &Frameworks, stored: &crate::store::Stored, change: Change) {
-    if !stored.mentions(FRAMEWORK_LABEL) {
+    if change == Change::Delete {
+        frameworks.roster().remove(&stored.uid);
+    }
+    if !stored.mentions(FRAMEWORK_LABEL) && !stored.mentions(ACKNOWLEDGE_FINALIZER) {
         return;
     }
     let Some(task) = objects::read::<Task>(stored) else { return };
+    if change == Change::Put {
+        frameworks.roster().put(stored, &task);
+    }
     let Some(framework) = subscribe::owner_of(&task.metadata) else { return };
     if change == Change::Put && super::session::is_open(&task) {
         frameworks.put_update(&framework, convert::update(&task, stored.revision));

@@ -1,0 +1,121 @@
+//! Framework → executor → framework, against a raw echo over TCP on loopback.
+//!
+//! ```text
+//!   floor:  client ⇄ TCP ⇄ echo                                                    2 sockets
+//!   ours:   framework ⇄ TLS, HTTP/2 ⇄ controller ⇄ TLS, HTTP/2 ⇄ agent ⇄ executor  6 sockets
+//! ```
+//!
+//! Both sides of the floor read a message whole before they go on, as a message is. The echo of the floor is a thread of
+//! this process; every other box is a process of its own.
+
+use std::io::{Read as _, Write as _};
+use std::net::{TcpListener, TcpStream};
+use std::time::{Duration, Instant};
+
+use bytes::Bytes;
+use muster_sdk::{Event, EventStream, Framework, FrameworkHandle, Launch};
+use muster_tests::{AgentOptions, Cluster};
+
+use crate::stats::{Samples, figure};
+
+/// Bytes, and how many pairs.
+const SIZES: [(usize, usize); 4] = [(10, 500), (1 << 10, 500), (64 << 10, 300), (1 << 20, 200)];
+/// Pairs before those that count: buffers and windows grow to their size.
+const WARM_UP: usize = 20;
+
+/// An echo whose two sides know how long a message is.
+struct Raw(TcpStream);
+
+impl Raw {
+    fn new(size: usize) -> Raw {
+        let listener = TcpListener::bind("127.0.0.1:0").expect("loopback");
+        let address = listener.local_addr().expect("bound");
+        // It ends with the connection.
+        std::thread::spawn(move || {
+            let (mut stream, _) = listener.accept().expect("a client");
+            stream.set_nodelay(true).expect("TCP");
+            let mut message = vec![0; size];
+            while stream.read_exact(&mut message).is_ok() && stream.write_all(&message).is_ok() {}
+        });
+        let stream = TcpStream::connect(address).expect("it listens");
+        stream.set_nodelay(true).expect("TCP");
+        Raw(stream)
+    }
+
+    fn round(&mut self, message: &[u8], answer: &mut [u8]) -> Duration {
+        let begin = Instant::now();
+        self.0.write_all(message).expect("it reads");
+        self.0.read_exact(answer).expect("it answers");
+        begin.elapsed()
+    }
+}
+
+/// A framework and its executor.
+struct Ours {
+    handle: FrameworkHandle,
+    events: EventStream,
+    executor: String,
+}
+
+impl Ours {
+    async fn start(cluster: &Cluster) -> Ours {
+        let connected = Framework::builder("messages").connect(Some(&cluster.kubeconfig())).await;
+        let (handle, mut events) = connected.expect("the kubeconfig is good");
+        let offer = loop {
+            if let Event::Offers(offers) = events.next().await.expect("it runs") {
+                break offers.into_iter().next().expect("an offer");
+            }
+        };
+        // Without a limit of cpu: the kernel's throttling is not what is measured.
+        let echo = Launch::process([env!("CARGO_BIN_EXE_echo-executor")]).memory("256Mi");
+        let launched = handle.launch_tasks([echo.on(&offer)]).await.expect("launched");
+        handle.suppress_offers().await.expect("taken");
+        let mut ours = Ours { handle, events, executor: launched[0].task.clone() };
+        assert_eq!(ours.answer().await, "ready");
+        ours
+    }
+
+    async fn answer(&mut self) -> Bytes {
+        loop {
+            match self.events.next().await.expect("it runs") {
+                Event::Message(message) => return message.data,
+                Event::Update(update) => self.handle.acknowledge_status_update(&update).await,
+                _ => {}
+            }
+        }
+    }
+
+    async fn round(&mut self, message: &Bytes) -> Duration {
+        let begin = Instant::now();
+        let sent = self.handle.send_framework_message(&self.executor, message.clone()).await;
+        sent.expect("its node is there");
+        let answer = self.answer().await;
+        let elapsed = begin.elapsed();
+        assert!(answer == *message, "{} bytes came back", answer.len());
+        elapsed
+    }
+}
+
+pub(crate) async fn round_trip() {
+    let mut cluster = Cluster::start().await;
+    cluster.join(AgentOptions::cloud("cloud")).await;
+    let mut ours = Ours::start(&cluster).await;
+    for (size, pairs) in SIZES {
+        let message = Bytes::from(vec![7; size]);
+        let (mut raw, mut answer) = (Raw::new(size), vec![0; size]);
+        let (mut floor, mut through) = (Samples::default(), Samples::default());
+        for pair in 0..WARM_UP + pairs {
+            let (one, other) = (raw.round(&message, &mut answer), ours.round(&message).await);
+            if pair >= WARM_UP {
+                floor.push(one);
+                through.push(other);
+            }
+        }
+        floor.line(&format!("floor: TCP echo, {size} B"));
+        through.line(&format!("framework - executor - framework, {size} B"));
+        let ratio = through.median().as_secs_f64() / floor.median().as_secs_f64();
+        let aim = if size == 1 << 20 { "<= 5x" } else { "none: hops, not bytes" };
+        figure(&format!("p50 ratio at {size} B"), ratio, "x", aim);
+    }
+    ours.handle.stop(false).await.expect("it is torn down");
+}
