@@ -223,6 +223,7 @@ impl Session<'_> {
                     self.say(Say::Message(message)).await?;
                 }
                 () = shared.board.changed() => self.say_reports().await?,
+                pose = self.node.moved() => self.say(Say::Pose(pose)).await?,
                 _ = beats.tick() => {
                     if last_heard.elapsed() > DEAF_AFTER.max(interval * 4) {
                         return Err(SessionError::Deaf);
@@ -312,7 +313,7 @@ impl Session<'_> {
         });
         let heartbeat = proto::Heartbeat {
             sequence: self.beat,
-            pose: self.node.moved(),
+            pose: None,
             usage: usage.collect(),
             node: self.node.usage(),
         };

@@ -6,6 +6,8 @@
 //! | [`schedule`] | Nodes, Tasks, Leases | binds Pending tasks, or writes why not |
 //! | [`desk`] | frameworks, in [`schedule`]'s own task | shows offers, takes Accepts |
 //! | [`failover`] | Frameworks | removes those that stay away, writes their numbers |
+//! | `moves` | live poses, in [`schedule`]'s own task | puts robots where they are |
+//! | [`checkpoints`] | live poses | writes them into Node status, coarsely |
 //! | [`books`] | the scheduler's ledger | writes used, free and leases into Node status |
 //! | [`health`] | heartbeats | marks silent nodes and their tasks |
 //! | [`deletion`] | Tasks being deleted | removes those whose processes are gone |
@@ -14,12 +16,14 @@
 
 mod bind;
 pub mod books;
+pub mod checkpoints;
 pub mod deletion;
 pub mod desk;
 pub mod failover;
 pub mod garbage;
 pub mod health;
 pub mod history;
+mod moves;
 pub mod schedule;
 
 use std::sync::Arc;
@@ -30,6 +34,7 @@ use tokio_util::task::TaskTracker;
 use crate::context::Context;
 use crate::session::Sessions;
 use crate::session::frameworks::{Frameworks, updates};
+use crate::session::poses::{self, LivePoses};
 use crate::store::{Store, WatchEnd, WatchError, Watcher};
 
 /// How long a loop waits after the store failed before it tries again. Commits fail when the disk
@@ -44,9 +49,15 @@ pub struct Reconcilers {
 }
 
 /// Starts every loop; each ends when `context.stop` is cancelled.
-pub fn spawn(context: &Arc<Context>, sessions: &Arc<Sessions>, tasks: &TaskTracker) -> Reconcilers {
+pub fn spawn(
+    context: &Arc<Context>,
+    sessions: &Arc<Sessions>,
+    poses: &Arc<LivePoses>,
+    tasks: &TaskTracker,
+) -> Reconcilers {
     let books = Arc::new(books::Books::default());
-    let (scheduler, handle) = schedule::Scheduler::new(Arc::clone(context), Arc::clone(&books));
+    let (scheduler, handle) =
+        schedule::Scheduler::new(Arc::clone(context), Arc::clone(&books), Arc::clone(poses));
     let loops = context.stop.clone();
     let run = |name: &'static str, work: std::pin::Pin<Box<dyn Future<Output = ()> + Send>>| {
         let stop = loops.clone();
@@ -64,6 +75,8 @@ pub fn spawn(context: &Arc<Context>, sessions: &Arc<Sessions>, tasks: &TaskTrack
     run("garbage", Box::pin(garbage::run(Arc::clone(context))));
     run("history", Box::pin(history::run(Arc::clone(context))));
     run("board", Box::pin(crate::session::board::run(Arc::clone(context), Arc::clone(sessions))));
+    run("poses", Box::pin(poses::run(Arc::clone(context), Arc::clone(poses))));
+    run("checkpoints", Box::pin(checkpoints::run(Arc::clone(context), Arc::clone(poses))));
     Reconcilers { scheduler: handle }
 }
 

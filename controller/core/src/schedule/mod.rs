@@ -84,6 +84,20 @@ pub const WHY_LIMIT: usize = 16;
 
 /// Decides for all waiting tasks at once.
 pub fn schedule(cluster: &mut Cluster, demands: &mut [Demand]) -> Plan {
+    decide(cluster, demands, |cluster, demand| summarise(explain(cluster, demand)).into())
+}
+
+/// What of the waiting tasks can be placed now that robots moved, without a word about the others: their reasons name
+/// every node, and robots move many times a second. Only tasks that ask for a place gain by it; the caller gives those.
+pub fn schedule_moved(cluster: &mut Cluster, demands: &mut [Demand]) -> Vec<Bind> {
+    decide(cluster, demands, |_, _| [].into()).binds
+}
+
+fn decide(
+    cluster: &mut Cluster,
+    demands: &mut [Demand],
+    say_why: impl Fn(&Cluster, &Demand) -> Arc<[NodeRefusal]>,
+) -> Plan {
     demands.sort_by_key(|d| (std::cmp::Reverse(d.spec.priority), d.since));
     let mut plan = Plan::default();
     // A pass only takes, so what had no place for a task has none for one that asks the same.
@@ -110,7 +124,7 @@ pub fn schedule(cluster: &mut Cluster, demands: &mut [Demand]) -> Plan {
                 plan.binds.push(bind);
             }
             None => {
-                let why: Arc<[NodeRefusal]> = summarise(explain(cluster, demand)).into();
+                let why = say_why(cluster, demand);
                 if hopeless.len() == HOPELESS_KEPT {
                     hopeless.remove(0);
                 }
