@@ -6,5 +6,6 @@ mod fence;
 mod figure4;
 mod frameworks;
 mod lease;
+mod poses;
 mod quotas;
 mod survival;
