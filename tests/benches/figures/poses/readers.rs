@@ -59,11 +59,14 @@ const SIDE: f64 = 1000.0;
 
 /// `count` frameworks, each of which moves by a metre ten times a second; offers that they were made are counted.
 pub(crate) async fn wander(client: &Client, count: usize, offers: Arc<AtomicU64>) -> JoinSet<()> {
+    // A name stays with its framework for a while after its session: each round has others.
+    static NEXT: AtomicU64 = AtomicU64::new(1);
     let mut tasks = JoinSet::new();
     for i in 0..count {
+        let number = NEXT.fetch_add(1, Ordering::Relaxed);
         let at = (i as f64 * 97.0 % SIDE, i as f64 * 371.0 % SIDE);
         let Framework { client, session, mut events } =
-            Framework::open(client, &format!("wanderer-{i}"), at, 25.0).await;
+            Framework::open(client, &format!("wanderer-{number}"), at, 25.0).await;
         let offers = Arc::clone(&offers);
         tasks.spawn(async move {
             while let Some(Ok(line)) = events.next().await {
