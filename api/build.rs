@@ -17,8 +17,10 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let package = |name: &str| root.join(format!("muster/{name}/v1/{name}.proto"));
     let agent = protox::compile([package("agent")], [root])?;
     let sessions = protox::compile([package("framework"), package("executor")], [root])?;
+    let poses = protox::compile([package("pose")], [root])?;
     let plain = || tonic_prost_build::configure().build_client(false).build_server(false);
     plain().bytes(".muster.agent.v1.Message.data").compile_fds(agent)?;
+    plain().compile_fds(poses)?;
     plain()
         .bytes(".")
         .compile_well_known_types(true)

@@ -7,9 +7,11 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let root = Path::new("../api/proto");
     println!("cargo:rerun-if-changed=../api/proto");
     let package = |name: &str| root.join(format!("muster/{name}/v1/{name}.proto"));
-    let files = || protox::compile([package("agent"), package("framework")], [root]);
+    let packages = ["agent", "framework", "pose"];
+    let files = || protox::compile(packages.map(package), [root]);
     let messages = "::muster_api::wire::agent::v1";
     let framework = "::muster_api::wire::framework::v1";
+    let pose = "::muster_api::wire::pose::v1";
     let client = Path::new(&std::env::var("OUT_DIR")?).join("client");
     std::fs::create_dir_all(&client)?;
     tonic_prost_build::configure()
@@ -17,6 +19,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         .build_transport(false)
         .extern_path(".muster.agent.v1", messages)
         .extern_path(".muster.framework.v1", framework)
+        .extern_path(".muster.pose.v1", pose)
         .out_dir(client)
         .compile_fds(files()?)?;
     tonic_prost_build::configure()
@@ -27,6 +30,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         )
         .extern_path(".muster.agent.v1", messages)
         .extern_path(".muster.framework.v1", framework)
+        .extern_path(".muster.pose.v1", pose)
         .compile_fds(files()?)?;
     Ok(())
 }

@@ -74,7 +74,8 @@ pub struct Args {
     /// The map that positions are in [default: as given last, else map]
     #[arg(long, value_name = "NAME")]
     pub map: Option<String>,
-    /// Where the robot is, static:X,Y or static:X,Y,YAW [default: as given last]
+    /// Where the robot is: static:X,Y[,YAW], or file:PATH with a line X Y [YAW] that the robot keeps up to date
+    /// [default: as given last]
     #[arg(long, value_name = "SOURCE", allow_hyphen_values = true)]
     pub position: Option<String>,
     /// Offer at most this much cpu [default: as given last, else all]

@@ -2,17 +2,22 @@
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
+use std::time::Duration;
 
 use muster_api::condition::{Condition, ConditionStatus, QUOTAS_ENFORCED};
 use muster_api::kind::node::RuntimeStatus;
 use muster_api::pose::Pose;
 use muster_api::wire::agent::v1 as proto;
 use muster_api::wire::agent_session::NodeReport;
+use tokio::time::Instant;
 
 use crate::capacity::{Capacity, Machine};
 use crate::config::{Config, Kind};
 use crate::driver::Shared;
 use crate::position::Position;
+
+/// Between two live poses. A robot at 1.5 m/s moves 15 cm in it, less than placement by distance can care for.
+const POSE_EVERY: Duration = Duration::from_millis(100);
 
 /// The node's face. Owned by the link: it alone tells the controller.
 #[derive(Debug)]
@@ -20,10 +25,11 @@ pub(crate) struct Node {
     shared: Arc<Shared>,
     fixed: NodeReport,
     boot_id: String,
-    position: Option<Box<dyn Position>>,
+    position: Option<Position>,
     machine: Machine,
     told: Option<proto::NodeState>,
     told_pose: Option<Pose>,
+    told_pose_at: Option<Instant>,
 }
 
 /// Facts found at the start.
@@ -63,13 +69,23 @@ impl Node {
         };
         let boot_id = shared.boot_id.clone();
         let machine = Machine::default();
-        Node { shared, fixed, boot_id, position, machine, told: None, told_pose: None }
+        Node {
+            shared,
+            fixed,
+            boot_id,
+            position,
+            machine,
+            told: None,
+            told_pose: None,
+            told_pose_at: None,
+        }
     }
 
     /// Everything, for a Hello.
     pub(crate) fn state(&mut self) -> proto::NodeState {
-        let pose = self.position.as_ref().and_then(|position| position.current());
+        let pose = self.position.as_ref().and_then(Position::current);
         self.told_pose.clone_from(&pose);
+        self.told_pose_at = Some(Instant::now());
         let mut state = self.without_pose();
         self.told = Some(state.clone());
         state.pose = pose.as_ref().map(proto::Pose::from);
@@ -97,14 +113,20 @@ impl Node {
         if self.told.as_ref() == Some(&self.without_pose()) { None } else { Some(self.state()) }
     }
 
-    /// The pose, when it has changed since it was last told.
-    pub(crate) fn moved(&mut self) -> Option<proto::Pose> {
-        let pose = self.position.as_ref()?.current();
-        if pose == self.told_pose {
-            return None;
+    /// The pose, when it has changed since it was last told; at most once in [`POSE_EVERY`]. Cancel safe: it counts as
+    /// told when it is given.
+    pub(crate) async fn moved(&mut self) -> proto::Pose {
+        loop {
+            let Some(position) = &mut self.position else { return std::future::pending().await };
+            position.other_than(self.told_pose.as_ref()).await;
+            if let Some(at) = self.told_pose_at {
+                tokio::time::sleep_until(at + POSE_EVERY).await;
+            }
+            (self.told_pose, self.told_pose_at) = (position.current(), Some(Instant::now()));
+            if let Some(pose) = &self.told_pose {
+                return pose.into();
+            }
         }
-        self.told_pose.clone_from(&pose);
-        pose.as_ref().map(proto::Pose::from)
     }
 
     /// The machine's usage since the last look.

@@ -100,6 +100,29 @@ fn the_node_says_what_it_is() {
 }
 
 #[test]
+fn a_robot_that_moves_says_so() {
+    let controller = Controller::start();
+    let dir = tempfile::tempdir().unwrap();
+    let file = dir.path().join("pose");
+    let stand = |x: f64| {
+        let new = dir.path().join("new");
+        std::fs::write(&new, format!("{x} 2 0.5\n")).unwrap();
+        std::fs::rename(&new, &file).unwrap();
+    };
+    stand(1.0);
+    let source = format!("file:{}", file.display());
+    let _agent = Agent::start_with(&controller, &["--position", &source, "--map", "lab"]);
+    let newest = || controller.poses().pop().or_else(|| controller.state()?.pose);
+    until("its first pose", || newest().filter(|p| p.x == 1.0));
+    stand(3.0);
+    let pose = until("the move", || controller.poses().pop().filter(|p| p.x == 3.0));
+    assert_eq!((pose.map.as_str(), pose.source.as_str(), pose.yaw), ("lab", "file", 0.5));
+    assert!(pose.localized && pose.stamp.is_some());
+    std::fs::remove_file(&file).unwrap();
+    until("that it is lost", || controller.poses().pop().filter(|p| !p.localized));
+}
+
+#[test]
 fn everything_goes_on_without_a_controller() {
     let controller = Controller::start();
     let mut agent = Agent::start(&controller);

@@ -4,6 +4,7 @@ use std::fmt;
 use std::str::FromStr;
 
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::MicroTime;
+use k8s_openapi::jiff::Timestamp;
 use nalgebra::Point3;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -52,6 +53,79 @@ impl Pose {
     #[must_use]
     pub fn position(&self) -> Point3<f64> {
         Point3::new(self.x, self.y, self.z)
+    }
+
+    /// The same, borrowed.
+    #[must_use]
+    pub fn view(&self) -> PoseRef<'_> {
+        PoseRef {
+            map: &self.map,
+            x: self.x,
+            y: self.y,
+            z: self.z,
+            yaw: self.yaw,
+            stamp: self.stamp.as_ref().map(|s| s.0),
+            source: &self.source,
+            localized: self.localized,
+        }
+    }
+
+    /// Becomes `new`. Texts that stay the same are not allocated again: poses come a hundred thousand times a second.
+    pub fn set(&mut self, new: PoseRef<'_>) {
+        let keep = |old: &mut String, new: &str| {
+            if old != new {
+                new.clone_into(old);
+            }
+        };
+        keep(&mut self.map, new.map);
+        keep(&mut self.source, new.source);
+        (self.x, self.y, self.z, self.yaw) = (new.x, new.y, new.z, new.yaw);
+        (self.stamp, self.localized) = (new.stamp.map(MicroTime), new.localized);
+    }
+}
+
+/// A [`Pose`] whose texts are somebody else's; the fields are the same.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PoseRef<'a> {
+    /// The map whose frame the numbers are in.
+    pub map: &'a str,
+    /// East, metres.
+    pub x: f64,
+    /// North, metres.
+    pub y: f64,
+    /// Up, metres.
+    pub z: f64,
+    /// Heading, radians.
+    pub yaw: f64,
+    /// When the robot was there.
+    pub stamp: Option<Timestamp>,
+    /// What measured it.
+    pub source: &'a str,
+    /// False: the robot is not where this says.
+    pub localized: bool,
+}
+
+impl PoseRef<'_> {
+    /// The same place in the same map, localized or not; who says so and when may differ.
+    #[must_use]
+    pub fn is_at(&self, other: &PoseRef<'_>) -> bool {
+        let place = |p: &PoseRef<'_>| (p.x, p.y, p.z, p.yaw, p.localized);
+        place(self) == place(other) && self.map == other.map
+    }
+}
+
+impl From<PoseRef<'_>> for Pose {
+    fn from(pose: PoseRef<'_>) -> Self {
+        Pose {
+            map: pose.map.to_owned(),
+            x: pose.x,
+            y: pose.y,
+            z: pose.z,
+            yaw: pose.yaw,
+            stamp: pose.stamp.map(MicroTime),
+            source: pose.source.to_owned(),
+            localized: pose.localized,
+        }
     }
 }
 

@@ -32,6 +32,8 @@ use crate::session::frameworks::proto::framework_service_server::FrameworkServic
 use crate::session::frameworks::service::Service;
 use crate::session::frameworks::{Frameworks, MAX_WIRE, lines};
 use crate::session::logs::SessionLogs;
+use crate::session::poses::proto::pose_service_server::PoseServiceServer;
+use crate::session::poses::{self, LivePoses};
 use crate::session::{self, Sessions};
 use crate::store::{self, OpenError, StoreError};
 use crate::{kubeconfig, metrics, reconcile, rest};
@@ -141,10 +143,10 @@ pub async fn start(config: Config) -> Result<Running, AppError> {
     kubeconfig::write(file, asked, &context.url(), context.pki.ca(), &admin)?;
 
     let background = TaskTracker::new();
-    let agents = spawn_background(&context, &background, happenings);
+    let services = spawn_background(&context, &background, happenings);
     let server = Server {
         tls,
-        router: router(&context, agents),
+        router: router(&context, services),
         stop: context.stop.clone(),
         kill: CancellationToken::new(),
         connections: TaskTracker::new(),
@@ -159,13 +161,14 @@ fn spawn_background(
     context: &Arc<Context>,
     background: &TaskTracker,
     happenings: mpsc::Receiver<Happening>,
-) -> Agents {
+) -> (Agents, poses::Service) {
     background.spawn(metrics::upkeep(context.metrics.clone(), context.stop.clone()));
     background.spawn(rest::namespace::finalize(Arc::clone(context)));
     let record = events::run(Arc::clone(context), happenings);
     background.spawn(context.stop.clone().run_until_cancelled_owned(record));
     let sessions = Arc::new(Sessions::default());
-    let reconcilers = reconcile::spawn(context, &sessions, background);
+    let poses = Arc::new(LivePoses::default());
+    let reconcilers = reconcile::spawn(context, &sessions, &poses, background);
     context.set_log_source(Arc::new(SessionLogs {
         context: Arc::downgrade(context),
         sessions: Arc::clone(&sessions),
@@ -178,15 +181,18 @@ fn spawn_background(
     ));
     reconcile::spawn_for_frameworks(context, &frameworks, background);
     context.set_live(Live {
-        scheduler: reconcilers.scheduler.clone(),
+        scheduler: reconcilers.scheduler,
         sessions: Arc::clone(&sessions),
         frameworks,
+        poses: Arc::clone(&poses),
     });
-    Agents::new(Arc::clone(context), sessions, reconcilers.scheduler, background.clone())
+    let publishers =
+        poses::Service::new(Arc::clone(&poses), background.clone(), context.stop.clone());
+    (Agents::new(Arc::clone(context), sessions, poses, background.clone()), publishers)
 }
 
 /// REST and gRPC as one router.
-fn router(context: &Arc<Context>, agents: Agents) -> Router {
+fn router(context: &Arc<Context>, (agents, publishers): (Agents, poses::Service)) -> Router {
     // Mounted by path, because the fallback of tonic's own router answers 200 to what it does not know.
     let frameworks = context.live().map(|live| Arc::clone(&live.frameworks));
     let frameworks = frameworks.map(|frameworks| {
@@ -202,6 +208,10 @@ fn router(context: &Arc<Context>, agents: Agents) -> Router {
             "/muster.agent.v1.AgentService/{*method}",
             session::proto::agent_service_server::AgentServiceServer::new(agents)
                 .max_decoding_message_size(MAX_WIRE),
+        )
+        .route_service(
+            "/muster.pose.v1.PoseService/{*method}",
+            PoseServiceServer::new(publishers).max_decoding_message_size(MAX_WIRE),
         )
         .merge(frameworks.unwrap_or_default())
         .merge(rest::router(Arc::clone(context)))

@@ -6,7 +6,7 @@
 use rustls::pki_types::CertificateDer;
 
 use crate::pki::{ADMINS, NODE_PREFIX, NODES, hex};
-use crate::rest::path::{Target, Verb};
+use crate::rest::path::{Subresource, Target, Verb};
 
 /// Who is at the other end of a connection.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -93,7 +93,7 @@ pub(crate) fn permits(identity: &Identity, verb: Verb, target: &Target) -> Permi
             Target::Objects(object)
                 if verb == Verb::Get
                     && object.entry.resource.as_str() == "nodes"
-                    && object.subresource.is_none()
+                    && matches!(object.subresource, None | Some(Subresource::Pose))
                     && object.name.as_deref() == Some(name) =>
             {
                 Permission::Granted

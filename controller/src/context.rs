@@ -15,6 +15,7 @@ use crate::reconcile::schedule;
 use crate::rest::log::LogSource;
 use crate::session::Sessions;
 use crate::session::frameworks::Frameworks;
+use crate::session::poses::LivePoses;
 use crate::store::Store;
 
 /// Where "now" comes from; tests hold it still.
@@ -67,6 +68,8 @@ pub struct Live {
     pub sessions: Arc<Sessions>,
     /// Who takes offers.
     pub frameworks: Arc<Frameworks>,
+    /// Where robots are.
+    pub poses: Arc<LivePoses>,
 }
 
 impl Context {

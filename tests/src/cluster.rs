@@ -184,6 +184,16 @@ impl Cluster {
         kubeconfig.clusters[0].cluster.as_ref().and_then(|c| c.server.clone()).expect("a server")
     }
 
+    /// Where the controller listens.
+    ///
+    /// # Panics
+    ///
+    /// When it was never ready.
+    #[must_use]
+    pub fn address(&self) -> std::net::SocketAddr {
+        self.listen.parse().expect("the kernel's choice")
+    }
+
     /// The controller's process.
     #[must_use]
     pub fn controller_pid(&self) -> u32 {

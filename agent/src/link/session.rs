@@ -232,6 +232,7 @@ impl Session<'_> {
                 () = shared.board.changed() => self.say_reports().await?,
                 // Closed: the desks end with the agent.
                 Ok(()) = executors.changed() => self.say_executors(&mut executors).await?,
+                pose = self.node.moved() => self.say(Say::Pose(pose)).await?,
                 _ = beats.tick() => {
                     if last_heard.elapsed() > DEAF_AFTER.max(interval * 4) {
                         return Err(SessionError::Deaf);
@@ -329,7 +330,7 @@ impl Session<'_> {
         });
         let heartbeat = proto::Heartbeat {
             sequence: self.beat,
-            pose: self.node.moved(),
+            pose: None,
             usage: usage.collect(),
             node: self.node.usage(),
         };

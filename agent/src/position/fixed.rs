@@ -1,33 +1,22 @@
 //! A robot that stands still.
 
 use muster_api::pose::{FixedPosition, Pose};
+use tokio::sync::watch;
 
 use super::Position;
 
-#[derive(Debug)]
-pub(super) struct Fixed {
-    place: FixedPosition,
-    map: String,
-}
-
-impl Fixed {
-    pub(super) fn new(place: FixedPosition, map: &str) -> Fixed {
-        Fixed { place, map: map.to_owned() }
-    }
-}
-
-impl Position for Fixed {
-    fn current(&self) -> Option<Pose> {
-        Some(Pose {
-            map: self.map.clone(),
-            x: self.place.x,
-            y: self.place.y,
-            z: 0.0,
-            yaw: self.place.yaw,
-            // The pose holds now as it will hold later; a stamp would only make it look new.
-            stamp: None,
-            source: "static".to_owned(),
-            localized: true,
-        })
-    }
+pub(super) fn open(place: FixedPosition, map: &str) -> Position {
+    let pose = Pose {
+        map: map.to_owned(),
+        x: place.x,
+        y: place.y,
+        z: 0.0,
+        yaw: place.yaw,
+        // The pose holds now as it will hold later; a stamp would only make it look new.
+        stamp: None,
+        source: "static".to_owned(),
+        localized: true,
+    };
+    // Nobody ever says anything else: the sender is not kept.
+    Position { newest: watch::channel(Some(pose)).1, _source: None }
 }

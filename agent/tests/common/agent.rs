@@ -46,7 +46,9 @@ impl Agent {
         if !args.contains(&"--docker-socket") {
             all.extend(["--docker-socket".to_owned(), "none".to_owned()]);
         }
-        all.extend(["--position".to_owned(), "static:1,2".to_owned()]);
+        if !args.contains(&"--position") {
+            all.extend(["--position".to_owned(), "static:1,2".to_owned()]);
+        }
         all.extend([
             "--join".to_owned(),
             controller.url(),

@@ -48,6 +48,7 @@ struct Seen {
     reports: BTreeMap<String, Vec<proto::TaskReport>>,
     hellos: Vec<proto::Hello>,
     states: Vec<proto::NodeState>,
+    poses: Vec<proto::Pose>,
     usage: BTreeMap<String, proto::Usage>,
     beats: u64,
     logs: BTreeMap<u64, (Vec<u8>, Option<String>)>,
@@ -128,6 +129,11 @@ impl Controller {
 
     pub fn state(&self) -> Option<proto::NodeState> {
         self.seen(|seen| seen.states.last().cloned())
+    }
+
+    /// Live poses, apart from those of a Hello.
+    pub fn poses(&self) -> Vec<proto::Pose> {
+        self.seen(|seen| seen.poses.clone())
     }
 
     pub fn set_mute(&self, mute: bool) {
@@ -447,6 +453,10 @@ fn take(seen: &mut Seen, heard: Heard) {
         }
         Heard::Node(state) => {
             seen.states.push(state);
+            None
+        }
+        Heard::Pose(pose) => {
+            seen.poses.push(pose);
             None
         }
         Heard::Task(report) => {

@@ -16,6 +16,7 @@
 //! | [`launch`] | tasks to launch |
 //! | [`position`] | where the work is, and sources that move it |
 //! | [`filter`] | what a node must have to be offered |
+//! | [`poses`] | for a building's localisation: a stream of robots' poses |
 //! | [`executor`] | the other side: a program that runs a framework's tasks |
 //! | `link` | the session: kubeconfig, TLS, reconnecting, duplicates |
 //!
@@ -32,6 +33,7 @@ pub mod framework;
 pub mod handle;
 pub mod launch;
 mod link;
+pub mod poses;
 pub mod position;
 pub mod scheduler;
 

@@ -4,6 +4,7 @@
 pub mod agent_session;
 mod error;
 pub mod framework_session;
+pub mod pose_stream;
 
 pub use error::WireError;
 
@@ -59,5 +60,20 @@ pub mod agent {
     )]
     pub mod v1 {
         include!(concat!(env!("OUT_DIR"), "/muster.agent.v1.rs"));
+    }
+}
+
+/// Package `muster.pose`.
+pub mod pose {
+    /// Messages of a stream of poses.
+    #[expect(missing_docs, reason = "generated; the .proto files hold the documentation")]
+    #[allow(
+        clippy::all,
+        clippy::allow_attributes,
+        clippy::allow_attributes_without_reason,
+        reason = "generated"
+    )]
+    pub mod v1 {
+        include!(concat!(env!("OUT_DIR"), "/muster.pose.v1.rs"));
     }
 }

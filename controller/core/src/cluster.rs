@@ -61,8 +61,6 @@ impl NodeFacts {
     }
 
     fn same_but_for_pose(&self, other: &NodeFacts) -> bool {
-        // Localized or not decides who is offered the robot, so it is more than a move.
-        let located = |f: &NodeFacts| f.pose.as_ref().map(|p| (p.map.clone(), p.localized));
         self.kind == other.kind
             && self.labels == other.labels
             && self.unschedulable == other.unschedulable
@@ -71,8 +69,17 @@ impl NodeFacts {
             && self.not_ready == other.not_ready
             && self.sensors == other.sensors
             && self.actuators == other.actuators
-            && located(self) == located(other)
+            && is_move(self.pose.as_ref(), other.pose.as_ref())
             && self.runtimes == other.runtimes
+    }
+}
+
+/// From one to the other the robot only moves. Localized or not decides who is offered the robot, so it is more than
+/// that.
+fn is_move(from: Option<&Pose>, to: Option<&Pose>) -> bool {
+    match (from, to) {
+        (Some(from), Some(to)) => from.map == to.map && from.localized == to.localized,
+        (from, to) => from.is_none() && to.is_none(),
     }
 }
 
@@ -132,6 +139,8 @@ pub struct Member {
     pub version: u64,
     /// Grows with every change of facts alone.
     pub facts_version: u64,
+    /// Its pose came by [`Cluster::set_pose`]; what the Node object says of it is older from then on.
+    live_pose: bool,
     in_order: Option<FreeKey>,
 }
 
@@ -175,6 +184,7 @@ impl Cluster {
             executors: Vec::new(),
             version: 0,
             facts_version: 0,
+            live_pose: false,
             in_order: None,
         });
         self.slots.insert(name.clone(), slot);
@@ -184,7 +194,11 @@ impl Cluster {
     /// Takes in the present state of a Node object.
     pub fn upsert_node(&mut self, name: &NodeName, node: &Node) {
         let slot = self.slot(name);
-        let facts = self.models.facts(node);
+        let mut facts = self.models.facts(node);
+        let member = &mut self.members[slot as usize];
+        if let Some(known) = member.facts.as_ref().filter(|_| member.live_pose) {
+            facts.pose.clone_from(&known.pose);
+        }
         let allocatable = node.status.as_ref().map(|s| s.allocatable.clone()).unwrap_or_default();
         self.index_pose(slot, facts.kind, facts.pose.as_ref());
         let member = &mut self.members[slot as usize];
@@ -202,14 +216,25 @@ impl Cluster {
         }
     }
 
-    /// A robot moved; poses come more often than Node objects change.
+    /// A robot moved; poses come more often than Node objects change, and are newer. A node that is not there is passed
+    /// over.
     pub fn set_pose(&mut self, name: &NodeName, pose: &Pose) {
         let Some(&slot) = self.slots.get(name) else { return };
-        let Some(facts) = self.members[slot as usize].facts.as_mut() else { return };
-        facts.pose = Some(pose.clone());
+        let member = &mut self.members[slot as usize];
+        let Some(facts) = member.facts.as_mut() else { return };
+        member.live_pose = true;
+        let moves = is_move(facts.pose.as_ref(), Some(pose));
+        match &mut facts.pose {
+            Some(old) => old.set(pose.view()),
+            None => facts.pose = Some(pose.clone()),
+        }
         let kind = facts.kind;
         self.moved.insert(slot);
         self.index_pose(slot, kind, Some(pose));
+        if !moves {
+            self.members[slot as usize].facts_version += 1;
+            self.touch(slot);
+        }
     }
 
     /// Takes in which executors live on a node.
@@ -233,7 +258,8 @@ impl Cluster {
     pub fn remove_node(&mut self, name: &NodeName) {
         let Some(&slot) = self.slots.get(name) else { return };
         self.space.remove(slot);
-        self.members[slot as usize].facts = None;
+        let member = &mut self.members[slot as usize];
+        (member.facts, member.live_pose) = (None, false);
         self.touch(slot);
     }
 

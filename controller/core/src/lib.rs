@@ -11,6 +11,7 @@
 //! | module | decides |
 //! |---|---|
 //! | [`ledger`] | what each node has left, and who holds its actuators (invariants 1 and 2) |
+//! | [`poses`] | where every robot is now, and when that is written down |
 //! | [`space`] | which robots are nearest, without a scan |
 //! | [`cluster`] | the nodes with their ledgers, and the orders in which they are tried |
 //! | [`schedule`] | where a task goes, or why it goes nowhere (invariant 6) |
@@ -30,6 +31,7 @@ mod fixtures;
 pub mod ledger;
 pub mod node_health;
 pub mod offer;
+pub mod poses;
 pub mod preempt;
 pub mod recent;
 pub mod report;

@@ -7,6 +7,8 @@
 //! | [`deadline`] | Tasks with deadlines | orders the end of those that have run long enough, removes those that ended long ago |
 //! | [`desk`] | frameworks, in [`schedule`]'s own task | shows offers, takes Accepts |
 //! | [`failover`] | Frameworks | removes those that stay away, writes their numbers |
+//! | `moves` | live poses, in [`schedule`]'s own task | puts robots where they are |
+//! | [`checkpoints`] | live poses | writes them into Node status, coarsely |
 //! | [`books`] | the scheduler's ledger | writes used, free and leases into Node status |
 //! | [`quotas`] | the scheduler's ledger | writes what namespaces have into Quota status |
 //! | [`health`] | heartbeats | marks silent nodes and their tasks |
@@ -16,6 +18,7 @@
 
 mod bind;
 pub mod books;
+pub mod checkpoints;
 pub mod deadline;
 pub mod deletion;
 pub mod desk;
@@ -23,6 +26,7 @@ pub mod failover;
 pub mod garbage;
 pub mod health;
 pub mod history;
+mod moves;
 mod preempt;
 pub mod quotas;
 pub mod schedule;
@@ -35,6 +39,7 @@ use tokio_util::task::TaskTracker;
 use crate::context::Context;
 use crate::session::Sessions;
 use crate::session::frameworks::{Frameworks, updates};
+use crate::session::poses::{self, LivePoses};
 use crate::store::{Store, WatchEnd, WatchError, Watcher};
 
 /// How long a loop waits after the store failed before it tries again. Commits fail when the disk
@@ -49,11 +54,17 @@ pub struct Reconcilers {
 }
 
 /// Starts every loop; each ends when `context.stop` is cancelled.
-pub fn spawn(context: &Arc<Context>, sessions: &Arc<Sessions>, tasks: &TaskTracker) -> Reconcilers {
+pub fn spawn(
+    context: &Arc<Context>,
+    sessions: &Arc<Sessions>,
+    poses: &Arc<LivePoses>,
+    tasks: &TaskTracker,
+) -> Reconcilers {
     let books = Arc::new(books::Books::default());
     let counts = Arc::new(quotas::Counts::default());
     let written = (Arc::clone(&books), Arc::clone(&counts));
-    let (scheduler, handle) = schedule::Scheduler::new(Arc::clone(context), written);
+    let (scheduler, handle) =
+        schedule::Scheduler::new(Arc::clone(context), written, Arc::clone(poses));
     let loops = context.stop.clone();
     let run = |name: &'static str, work: std::pin::Pin<Box<dyn Future<Output = ()> + Send>>| {
         let stop = loops.clone();
@@ -73,6 +84,8 @@ pub fn spawn(context: &Arc<Context>, sessions: &Arc<Sessions>, tasks: &TaskTrack
     run("garbage", Box::pin(garbage::run(Arc::clone(context))));
     run("history", Box::pin(history::run(Arc::clone(context))));
     run("board", Box::pin(crate::session::board::run(Arc::clone(context), Arc::clone(sessions))));
+    run("poses", Box::pin(poses::run(Arc::clone(context), Arc::clone(poses))));
+    run("checkpoints", Box::pin(checkpoints::run(Arc::clone(context), Arc::clone(poses))));
     Reconcilers { scheduler: handle }
 }
 

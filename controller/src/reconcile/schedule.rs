@@ -3,6 +3,7 @@
 //! ```text
 //!   store.watch_all ──▶ take_in ──▶ Cluster + waiting tasks ──core::schedule──▶ Plan ──▶ transactions
 //!   questions (plan, why) ─────────────▲ answered from a copy, nothing is changed
+//!   live poses (see `moves`) ──────────▲ whoever moved, as it is now; looked at again are tasks that ask for a place, and offers
 //! ```
 //!
 //! One task owns the cluster, so decisions are made one after the other. A bind is one transaction:
@@ -22,7 +23,6 @@ use muster_api::kind::quota::Quota;
 use muster_api::kind::task::{NodeRefusal, PREEMPTING, Task, TaskSpec, TaskStatus};
 use muster_api::name::NodeName;
 use muster_api::phase::TaskPhase;
-use muster_api::pose::Pose;
 use muster_controller_core::cluster::{Cluster, Executor};
 use muster_controller_core::fairness::Accounts;
 use muster_controller_core::ledger::Reservation;
@@ -35,10 +35,12 @@ use tokio_util::task::AbortOnDropHandle;
 
 use super::books::{Books, Page};
 use super::desk::{self, Desk};
+use super::moves::Moves;
 use super::quotas::{Counter, Counts};
 use super::{RETRY, bind, next_events, preempt, watch_from_now};
 use crate::context::Context;
 use crate::objects::{self, LEASES, NODES, QUOTAS, TASKS};
+use crate::session::poses::LivePoses;
 use crate::store::{Change, Event, Op, StoreError, Stored, Watcher};
 
 /// How often changed numbers in a waiting task's reasons are written. New reasons are written at
@@ -51,7 +53,7 @@ const WHY_AT_ONCE: usize = 256;
 /// milliseconds: a few hundred keep both the disk and this task busy.
 const CHUNK: usize = 256;
 
-/// Questions that wait; they are answered between passes. 1024 poses are what 100 robots send in a second.
+/// Questions that wait; they are answered between passes.
 const QUESTIONS: usize = 1024;
 
 type Committed = Result<Vec<Arc<Stored>>, StoreError>;
@@ -63,8 +65,6 @@ enum Question {
     Plan { tasks: Vec<Demand>, answer: oneshot::Sender<schedule::Plan> },
     /// Why does this task wait? All nodes, not only those in its status.
     Why { demand: Demand, answer: oneshot::Sender<Vec<NodeRefusal>> },
-    /// A robot is somewhere else.
-    Pose { node: NodeName, pose: Pose },
     /// Which executors live on a node.
     Executors { node: NodeName, executors: Vec<Executor> },
     /// Something for the frameworks' desk.
@@ -123,12 +123,6 @@ impl Handle {
         let question = Question::Executors { node, executors };
         self.questions.send(question).await.map_err(|_| Ended)
     }
-
-    /// Says where a robot is now. Lost when the scheduler is busy: the next pose comes soon.
-    pub fn pose(&self, node: NodeName, pose: Pose) {
-        // A full queue means poses come faster than they are taken in; newer ones follow.
-        drop(self.questions.try_send(Question::Pose { node, pose }));
-    }
 }
 
 /// A task without a place.
@@ -150,7 +144,12 @@ pub struct Scheduler {
     questions: mpsc::Receiver<Question>,
     cluster: Cluster,
     desk: Desk,
+    moves: Moves,
     waiting: HashMap<TaskUid, Waiting>,
+    /// When waiting tasks are looked at again even if nothing changes.
+    look_again: Option<Instant>,
+    /// The store failed: robots that move are no reason to try again before.
+    binds_after: Option<Instant>,
     specs: Recent<TaskSpec>,
     /// Revisions that this task wrote and the watcher has not brought yet.
     own: HashSet<u64>,
@@ -164,6 +163,7 @@ impl Scheduler {
     pub fn new(
         context: Arc<Context>,
         (books, counts): (Arc<Books>, Arc<Counts>),
+        poses: Arc<LivePoses>,
     ) -> (Self, Handle) {
         let (sender, questions) = mpsc::channel(QUESTIONS);
         let scheduler = Scheduler {
@@ -173,7 +173,10 @@ impl Scheduler {
             counter: Counter::new(counts),
             questions,
             cluster: Cluster::new(),
+            moves: Moves::new(poses),
             waiting: HashMap::new(),
+            look_again: None,
+            binds_after: None,
             specs: Recent::default(),
             own: HashSet::new(),
             dirty: BTreeSet::new(),
@@ -184,8 +187,14 @@ impl Scheduler {
     /// Works until dropped.
     pub async fn run(mut self) {
         let mut watcher = self.rebuild().await;
+        self.decide().await;
+        let mut looking = None;
         loop {
-            let look_again = self.pass().await;
+            let desk = self.close_pass().await;
+            if let Some(began) = looking.take() {
+                self.moves.looked(began);
+            }
+            let look_again = soonest([self.look_again, desk]);
             tokio::select! {
                 // Cancel safe: events that were not returned are returned by the next call.
                 events = next_events(&mut watcher) => match events {
@@ -201,8 +210,15 @@ impl Scheduler {
                         self.answer(question);
                     }
                 }
+                // Cancel safe, as it says.
+                () = self.moves.due() => {
+                    looking = Some(Instant::now());
+                    self.look_at_moves().await;
+                    continue;
+                }
                 () = sleep_until(look_again) => {}
             }
+            self.decide().await;
         }
     }
 
@@ -231,6 +247,7 @@ impl Scheduler {
         for member in old.all().filter(|member| !member.executors.is_empty()) {
             self.cluster.set_executors(&member.name, member.executors.clone());
         }
+        self.moves.begin_anew(&mut self.cluster);
         tracing::info!(
             nodes = self.cluster.members().count(),
             waiting = self.waiting.len(),
@@ -302,7 +319,11 @@ impl Scheduler {
             return;
         }
         let Some(node) = objects::read::<Node>(stored) else { return };
+        let is_new = self.cluster.member(&name).is_none_or(|m| m.facts.is_none());
         self.cluster.upsert_node(&name, &node);
+        if let Some(pose) = is_new.then(|| self.moves.of_new(&name)).flatten() {
+            self.cluster.set_pose(&name, &pose);
+        }
         let page = self.cluster.member(&name).map(|m| Page::from(&m.ledger));
         if page.is_some_and(|p| !p.is_written(node.status.as_ref())) {
             self.dirty.insert(name);
@@ -392,7 +413,6 @@ impl Scheduler {
                 let nodes = why.iter().map(|(node, refusal)| refusal.of_node(node.as_str()));
                 drop(answer.send(quota.into_iter().chain(nodes).collect()));
             }
-            Question::Pose { node, pose } => self.cluster.set_pose(&node, &pose),
             Question::Executors { node, executors } => {
                 self.cluster.set_executors(&node, executors);
             }
@@ -400,10 +420,9 @@ impl Scheduler {
         }
     }
 
-    /// Decides for everything that waits, and carries it out. Says when to look again even if
-    /// nothing changes.
-    async fn pass(&mut self) -> Option<Instant> {
-        let mut retry = None;
+    /// Decides for everything that waits, and carries it out.
+    async fn decide(&mut self) {
+        self.look_again = None;
         if !self.waiting.is_empty() {
             let mut demands: Vec<Demand> =
                 self.waiting.values().map(|w| w.demand.clone()).collect();
@@ -411,20 +430,42 @@ impl Scheduler {
             let binds = self.bind_all(plan.binds).await;
             let preempted = self.preempt_all(plan.preemptions).await;
             let waits = self.write_reasons(plan.waits).await;
-            retry = [binds, preempted, waits].into_iter().flatten().min();
+            self.look_again = soonest([binds, preempted, waits]);
         }
+    }
+
+    /// Robots moved: offers follow them at the end of the pass, and tasks that ask for a place may have one now. Why the
+    /// others wait is written when everything is decided anew, a moment later.
+    async fn look_at_moves(&mut self) {
+        self.moves.take(&mut self.cluster);
+        let now = Instant::now();
+        let mut demands: Vec<Demand> = self
+            .waiting
+            .values()
+            .filter(|w| w.demand.spec.placement.at.is_some())
+            .map(|w| w.demand.clone())
+            .collect();
+        if demands.is_empty() || self.binds_after.is_some_and(|at| at > now) {
+            return;
+        }
+        let binds = schedule::schedule_moved(&mut self.cluster, &mut demands);
+        let retry = self.bind_all(binds).await;
+        self.look_again = soonest([self.look_again, retry, Some(now + WHY_EVERY)]);
+    }
+
+    /// Offers and books after what was decided. Says when the desk has something to do even if nothing changes.
+    async fn close_pass(&mut self) -> Option<Instant> {
         let desk = self.desk.work(&mut self.cluster).await;
         if !self.dirty.is_empty() {
             self.counter.changed();
         }
         let count = self.counter.work(&self.cluster);
-        let retry = [retry, desk, count].into_iter().flatten().min();
         for node in std::mem::take(&mut self.dirty) {
             if let Some(member) = self.cluster.member(&node) {
                 self.books.put(&node, Page::from(&member.ledger));
             }
         }
-        retry
+        soonest([desk, count])
     }
 
     async fn bind_all(&mut self, binds: Vec<Bind>) -> Option<Instant> {
@@ -457,6 +498,7 @@ impl Scheduler {
             }
             self.dirty.insert(bind.node);
         }
+        self.binds_after = retry;
         retry
     }
 
@@ -609,6 +651,10 @@ fn headline(why: &[NodeRefusal]) -> String {
     }
     let parts: Vec<String> = counts.iter().map(|(reason, n)| format!("{n} {reason}")).collect();
     format!("no node takes it: {}", parts.join(", "))
+}
+
+fn soonest<const N: usize>(instants: [Option<Instant>; N]) -> Option<Instant> {
+    instants.into_iter().flatten().min()
 }
 
 async fn sleep_until(deadline: Option<Instant>) {

@@ -15,6 +15,7 @@
 //! | [`token`], `join`, `enrol` | join tokens; certificates for agents; which agent speaks for a node |
 //! | `fence` | a person's word that a node is off |
 //! | `offers` | what frameworks are offered, and why they are not |
+//! | `poses` | where robots are now |
 //! | `question` | plan, why, usage: answers that are no objects |
 //! | [`log`] | logs of tasks |
 //! | [`failure`] | every refusal as a `metav1.Status` |
@@ -35,6 +36,7 @@ pub mod namespace;
 mod offers;
 mod patch;
 pub mod path;
+mod poses;
 mod query;
 mod question;
 pub(crate) mod registry;
@@ -136,6 +138,8 @@ async fn dispatch(
         Target::Plan => question::plan(call).await,
         Target::Usage => question::usage(&call),
         Target::Offers => offers::list(call.context).await,
+        Target::Poses if verb == Verb::Watch => poses::watch(&call),
+        Target::Poses => poses::list(&call),
         Target::Tokens(id) => token::answer(call, verb, id).await,
         Target::Objects(object) => objects(call, verb, object).await,
     }
@@ -150,6 +154,9 @@ async fn objects(call: Call, verb: Verb, object: Object) -> Answer {
     }
     if !object.allows(verb) {
         return Err(Failure::method_not_allowed(verb, &object));
+    }
+    if object.subresource == Some(Subresource::Pose) {
+        return poses::of_node(&call, &object);
     }
     if object.subresource == Some(Subresource::Fence) {
         return fence::fence(call, object).await;

@@ -79,6 +79,8 @@ pub enum Subresource {
     Why,
     /// `…/fence`
     Fence,
+    /// `…/pose`
+    Pose,
 }
 
 /// One object, or a collection when `name` is `None`.
@@ -100,7 +102,7 @@ impl Object {
 
     pub(crate) fn allows(&self, verb: Verb) -> bool {
         match self.subresource {
-            Some(Subresource::Log | Subresource::Why) => verb == Verb::Get,
+            Some(Subresource::Log | Subresource::Why | Subresource::Pose) => verb == Verb::Get,
             Some(Subresource::Fence) => verb == Verb::Create,
             Some(Subresource::Status) => {
                 self.entry.info.has_status
@@ -127,6 +129,8 @@ pub(crate) enum Target {
     Usage,
     /// What frameworks are offered now.
     Offers,
+    /// Where robots are now.
+    Poses,
     /// Join tokens; one when it is named.
     Tokens(Option<String>),
     Objects(Object),
@@ -142,6 +146,7 @@ impl Target {
             Self::Plan => Some("plan"),
             Self::Usage => Some("usage"),
             Self::Offers => Some("offers"),
+            Self::Poses => Some("poses"),
             _ => None,
         }
     }
@@ -171,6 +176,7 @@ pub(crate) fn read(method: &Method, uri: &Uri) -> Result<(Verb, Target), Failure
             ["plan"] => Target::Plan,
             ["usage"] => Target::Usage,
             ["offers"] => Target::Offers,
+            ["poses"] => Target::Poses,
             ["jointokens"] => Target::Tokens(None),
             ["jointokens", id] => Target::Tokens(Some((*id).to_owned())),
             _ => Target::Objects(object(muster_api::GROUP, rest).ok_or_else(unknown)?),
@@ -180,6 +186,7 @@ pub(crate) fn read(method: &Method, uri: &Uri) -> Result<(Verb, Target), Failure
     let named = match &target {
         Target::Objects(object) => object.name.is_some(),
         Target::Tokens(id) => id.is_some(),
+        Target::Poses => false,
         _ => true,
     };
     let verb = verb(method, uri, named).ok_or_else(|| Failure::method(method))?;
@@ -192,7 +199,8 @@ pub(crate) fn read(method: &Method, uri: &Uri) -> Result<(Verb, Target), Failure
             | Target::Usage
     );
     let post_only = matches!(target, Target::Join | Target::Plan);
-    if read_only && verb != Verb::Get || post_only && verb != Verb::Create {
+    let followed = matches!(target, Target::Poses) && !matches!(verb, Verb::List | Verb::Watch);
+    if read_only && verb != Verb::Get || post_only && verb != Verb::Create || followed {
         return Err(Failure::method(method));
     }
     Ok((verb, target))
@@ -238,6 +246,7 @@ fn object(group: &str, parts: &[&str]) -> Option<Object> {
         Some("log") if entry.has_log => Some(Subresource::Log),
         Some("why") if entry.has_why => Some(Subresource::Why),
         Some("fence") if entry.info.kind == "Node" => Some(Subresource::Fence),
+        Some("pose") if entry.info.kind == "Node" => Some(Subresource::Pose),
         Some(_) => return None,
     };
     // An object of a namespaced kind has no path outside its namespace.
@@ -291,6 +300,14 @@ mod tests {
                 "create nodes ns=None name=Some(\"n\") sub=Some(Fence)",
             ),
             ("POST", format!("{g}/namespaces/a/tasks/t/fence"), "404"),
+            (
+                "GET",
+                format!("{g}/nodes/n/pose"),
+                "get nodes ns=None name=Some(\"n\") sub=Some(Pose)",
+            ),
+            ("GET", format!("{g}/poses"), "list Poses"),
+            ("GET", format!("{g}/poses?watch=true"), "watch Poses"),
+            ("POST", format!("{g}/poses"), "405"),
             ("DELETE", format!("{g}/nodes"), "deletecollection nodes ns=None name=None sub=None"),
             ("GET", "/api/v1/namespaces".into(), "list namespaces ns=None name=None sub=None"),
             (

@@ -29,13 +29,13 @@ use wire::agent_message::Body as FromAgent;
 use wire::controller_message::Body as ToAgent;
 
 use super::nodes::{self, Speaker};
+use super::poses::LivePoses;
 use super::proto::agent_service_server::AgentService;
 use super::strays::lives;
 use super::{Connection, NodeUsage, Sessions, reports};
 use crate::auth::Identity;
 use crate::context::Context;
 use crate::objects;
-use crate::reconcile::schedule;
 
 /// An agent that connects says Hello at once.
 const HELLO_WITHIN: Duration = Duration::from_secs(10);
@@ -48,7 +48,7 @@ const OUTBOUND: usize = 64;
 pub struct Agents {
     context: Arc<Context>,
     sessions: Arc<Sessions>,
-    scheduler: schedule::Handle,
+    poses: Arc<LivePoses>,
     tasks: TaskTracker,
     next_id: AtomicU64,
 }
@@ -59,10 +59,10 @@ impl Agents {
     pub fn new(
         context: Arc<Context>,
         sessions: Arc<Sessions>,
-        scheduler: schedule::Handle,
+        poses: Arc<LivePoses>,
         tasks: TaskTracker,
     ) -> Self {
-        Agents { context, sessions, scheduler, tasks, next_id: AtomicU64::new(1) }
+        Agents { context, sessions, poses, tasks, next_id: AtomicU64::new(1) }
     }
 }
 
@@ -87,7 +87,7 @@ impl AgentService for Agents {
         let session = Session {
             context: Arc::clone(&self.context),
             sessions: Arc::clone(&self.sessions),
-            scheduler: self.scheduler.clone(),
+            poses: Arc::clone(&self.poses),
             id: self.next_id.fetch_add(1, Ordering::Relaxed),
             node,
             key,
@@ -104,7 +104,7 @@ impl AgentService for Agents {
 pub(super) struct Session {
     pub(super) context: Arc<Context>,
     pub(super) sessions: Arc<Sessions>,
-    scheduler: schedule::Handle,
+    poses: Arc<LivePoses>,
     id: u64,
     pub(super) node: NodeName,
     /// Of the agent's certificate.
@@ -268,6 +268,7 @@ impl Session {
     ) -> Result<(), End> {
         match body {
             Some(FromAgent::Heartbeat(heartbeat)) => self.take_heartbeat(heartbeat).await,
+            Some(FromAgent::Pose(pose)) => self.take_pose(&pose),
             Some(FromAgent::Task(report)) => self.take_report(&report).await,
             Some(FromAgent::Node(state)) => {
                 self.is_newest()?;
@@ -316,9 +317,7 @@ impl Session {
             return Err(Status::aborted("the node was silent for too long; say Hello again").into());
         }
         if let Some(pose) = &heartbeat.pose {
-            let pose = Pose::try_from(pose).map_err(|e| Status::invalid_argument(e.to_string()))?;
-            nodes::write_pose(&self.context, &self.node, &pose).await.map_err(internal)?;
-            self.scheduler.pose(self.node.clone(), pose);
+            self.take_pose(pose)?;
         }
         let usage = NodeUsage { node: heartbeat.node.unwrap_or_default(), tasks: heartbeat.usage };
         self.sessions.set_usage(&self.node, usage);
@@ -330,7 +329,24 @@ impl Session {
         let Some(live) = self.context.live() else { return Ok(()) };
         let executors = live.frameworks.executors_on(&self.node, uids);
         // The scheduler ends only with the controller.
-        self.scheduler.executors(self.node.clone(), executors).await.map_err(|_| End::Closed)
+        live.scheduler.executors(self.node.clone(), executors).await.map_err(|_| End::Closed)
+    }
+
+    /// Not of an earlier session that still reads: it says where the robot was.
+    fn take_pose(&self, pose: &wire::Pose) -> Result<(), End> {
+        self.is_newest()?;
+        let pose = Pose::try_from(pose).map_err(|e| Status::invalid_argument(e.to_string()))?;
+        self.say_pose(&pose);
+        Ok(())
+    }
+
+    /// False: the building knows better.
+    fn say_pose(&self, pose: &Pose) -> bool {
+        let taken = self.poses.say_own(&self.node, pose);
+        if let Err(why) = &taken {
+            tracing::trace!(node = %self.node, %why, "the agent's pose is passed over");
+        }
+        taken.is_ok()
     }
 
     pub(super) async fn acknowledge(&self, report: &wire::TaskReport) -> Result<(), End> {
@@ -355,8 +371,10 @@ impl Session {
         state: Option<&wire::NodeState>,
     ) -> Result<(), End> {
         let state = state.ok_or_else(|| Status::invalid_argument("hello.state is missing"))?;
-        let report =
+        let mut report =
             NodeReport::try_from(state).map_err(|e| Status::invalid_argument(e.to_string()))?;
+        // The Node is written for the rest of the report anyway, so what counts is written with it.
+        report.pose = report.pose.filter(|pose| self.say_pose(pose));
         let written = nodes::write(&self.context, speaker, &report, &self.stray_names()).await;
         self.node_uid = written.map_err(|error| match error {
             nodes::NodeError::Store(store) => internal(store),

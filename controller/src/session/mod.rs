@@ -14,6 +14,7 @@
 //! | [`nodes`] | what an agent says of its node → the Node object |
 //! | [`reports`] | what an agent says of a task → the Task object and its lease |
 //! | [`frameworks`] | the sessions of frameworks |
+//! | [`poses`] | where robots are: their agents' word, and streams of a building's localisation |
 //! | `strays` | what an agent runs and should not |
 //! | [`logs`] | logs, asked of the agent that has them |
 
@@ -22,6 +23,7 @@ pub mod board;
 pub mod frameworks;
 pub mod logs;
 pub mod nodes;
+pub mod poses;
 pub mod reports;
 mod strays;
 

@@ -12,17 +12,12 @@ use muster_api::id::Incarnation;
 use muster_api::kind::lease::{DEFAULT_GROUP, Lease, LeaseSpec, LeaseStatus};
 use muster_api::kind::node::{Node, NodeKind, NodeStatus};
 use muster_api::name::NodeName;
-use muster_api::pose::Pose;
 use muster_api::wire::agent_session::NodeReport;
 
 use crate::context::Context;
 use crate::objects;
 use crate::rest::enrol;
 use crate::store::{Op, StoreError, Stored};
-
-/// How far a robot moves until its pose is written down again, metres. In between, the live pose is
-/// what placement uses.
-const POSE_STEP: f64 = 1.0;
 
 /// What a session says of its agent.
 #[derive(Debug, Clone)]
@@ -145,7 +140,10 @@ fn fill(context: &Context, speaker: &Speaker, report: &NodeReport, node: &mut No
     status.agent_version.clone_from(&speaker.version);
     status.address.clone_from(&report.address);
     if let Some(pose) = &report.pose
-        && status.pose.as_ref().is_none_or(|old| is_new_place(old, pose))
+        && status
+            .pose
+            .as_ref()
+            .is_none_or(|old| old.source != pose.source || !old.view().is_at(&pose.view()))
     {
         status.pose = Some(pose.clone());
     }
@@ -202,37 +200,6 @@ pub(crate) async fn write_strays(
         judge(object.status.get_or_insert_default(), strays, context.clock.now());
         (object != before).then(|| vec![objects::replace(stored, &object)])
     })
-    .await
-    .map(drop)
-}
-
-/// A pose worth writing down: in another map, or a step away.
-fn is_new_place(old: &Pose, new: &Pose) -> bool {
-    old.map != new.map
-        || old.localized != new.localized
-        || old.source != new.source
-        || nalgebra::distance(&old.position(), &new.position()) >= POSE_STEP
-        || (old.position() != new.position() && new.source.starts_with("static"))
-}
-
-/// Writes a moved robot's pose down, when it moved a step.
-pub(crate) async fn write_pose(
-    context: &Context,
-    node: &NodeName,
-    pose: &Pose,
-) -> Result<(), StoreError> {
-    objects::change(
-        &context.store,
-        &objects::node_key(node.as_str()),
-        |stored, mut object: Node| {
-            let status = object.status.get_or_insert_default();
-            if status.pose.as_ref().is_some_and(|old| !is_new_place(old, pose)) {
-                return None;
-            }
-            status.pose = Some(pose.clone());
-            Some(vec![objects::replace(stored, &object)])
-        },
-    )
     .await
     .map(drop)
 }

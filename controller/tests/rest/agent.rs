@@ -43,6 +43,16 @@ pub(crate) struct Credential {
     ca: String,
 }
 
+impl Credential {
+    pub(crate) fn certificate(&self) -> &str {
+        &self.certificate
+    }
+
+    pub(crate) fn key(&self) -> &str {
+        &self.key
+    }
+}
+
 /// Asks to join as the robot `node`; the code, and the answer's JSON.
 pub(crate) async fn ask_to_join(
     cluster: &Cluster,
@@ -72,6 +82,24 @@ pub(crate) async fn join(cluster: &Cluster, node: &str) -> Credential {
     assert_eq!(code, 200, "{answer}");
     let text = |field: &str| answer[field].as_str().unwrap().to_owned();
     Credential { node: node.to_owned(), key, certificate: text("certificate"), ca: text("ca") }
+}
+
+/// The admin's, as it stands in the kubeconfig.
+pub(crate) fn admin(cluster: &Cluster) -> Credential {
+    use base64::Engine as _;
+    let file = std::fs::read_to_string(cluster.kubeconfig()).unwrap();
+    let text = |field: &str| {
+        let line = file.lines().find_map(|l| l.trim().strip_prefix(field)).unwrap();
+        let data = line.trim_start_matches("-data:").trim();
+        let bytes = base64::engine::general_purpose::STANDARD.decode(data).unwrap();
+        String::from_utf8(bytes).unwrap()
+    };
+    Credential {
+        node: "admin".to_owned(),
+        key: text("client-key"),
+        certificate: text("client-certificate"),
+        ca: text("certificate-authority"),
+    }
 }
 
 /// What a test says about a task.
@@ -135,6 +163,11 @@ impl Session {
         self.say.send(wire::AgentMessage { body: Some(Say::Task(report)) }).await.unwrap();
     }
 
+    pub(crate) async fn say_pose(&self, pose: wire::Pose) {
+        // An ended session takes nothing any more, which is what some tests look at.
+        drop(self.say.send(wire::AgentMessage { body: Some(Say::Pose(pose)) }).await);
+    }
+
     /// The next message that is neither an acknowledgement nor a welcome.
     pub(crate) async fn assignments(&mut self) -> Result<wire::Assignments, Status> {
         loop {
@@ -174,7 +207,10 @@ fn robot() -> wire::NodeState {
     }
 }
 
-async fn channel(cluster: &Cluster, credential: &Credential) -> tonic::transport::Channel {
+pub(crate) async fn channel(
+    cluster: &Cluster,
+    credential: &Credential,
+) -> tonic::transport::Channel {
     let mut roots = RootCertStore::empty();
     roots.add(CertificateDer::from_pem_slice(credential.ca.as_bytes()).unwrap()).unwrap();
     let certificate = CertificateDer::from_pem_slice(credential.certificate.as_bytes()).unwrap();

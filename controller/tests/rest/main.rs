@@ -5,6 +5,7 @@ mod access;
 mod agent;
 mod fencing;
 mod objects;
+mod poses;
 mod removal;
 mod support;
 mod watching;

@@ -19,7 +19,7 @@ fn rss(pid: u32) -> f64 {
 }
 
 /// Cpu time that a process has used.
-fn cpu(pid: u32) -> Duration {
+pub(crate) fn cpu(pid: u32) -> Duration {
     let stat = std::fs::read_to_string(format!("/proc/{pid}/stat")).expect("it runs");
     let fields: Vec<u64> = stat
         .rsplit_once(')')

@@ -9,6 +9,7 @@ mod footprint;
 mod list;
 mod messages;
 mod placement;
+mod poses;
 mod stats;
 mod submit;
 mod writes;
@@ -38,11 +39,20 @@ const FIGURES: &[Figure] = &[
     ("list", "list of 10 000 nodes, against encoding it and a loopback write", || {
         Box::pin(list::nodes())
     }),
+    ("poses", "poses of 10 000 robots over 100 streams on one core, against a bare stream", || {
+        Box::pin(poses::all())
+    }),
     ("footprint", "RSS and idle CPU of agent and controller", || Box::pin(footprint::all())),
 ];
 
 fn main() -> ExitCode {
     let asked: Vec<String> = std::env::args().skip(1).filter(|a| a != "--bench").collect();
+    if let [bare, pki] = &asked[..]
+        && bare == "bare-stream"
+    {
+        poses::serve_bare(pki.as_ref());
+        return ExitCode::SUCCESS;
+    }
     if asked.iter().any(|a| a == "--list") {
         for (name, what, _) in FIGURES {
             println!("{name:10} {what}");

@@ -7,6 +7,7 @@ mod fence;
 mod figure4;
 mod frameworks;
 mod lease;
+mod poses;
 mod preemption;
 mod quotas;
 mod survival;

@@ -102,6 +102,26 @@ pub const WHY_LIMIT: usize = 16;
 
 /// Decides for all waiting tasks at once.
 pub fn schedule(cluster: &mut Cluster, demands: &mut [Demand]) -> Plan {
+    decide(cluster, demands, Depth::Whole)
+}
+
+/// What of the waiting tasks can be placed now that robots moved, without a word about the others: their reasons name
+/// every node, and robots move many times a second. Nobody is ended for them either. Only tasks that ask for a place gain
+/// by it; the caller gives those.
+pub fn schedule_moved(cluster: &mut Cluster, demands: &mut [Demand]) -> Vec<Bind> {
+    decide(cluster, demands, Depth::Places).binds
+}
+
+/// What is decided of tasks that have no place.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Depth {
+    /// Whether others make room, and why they wait.
+    Whole,
+    /// Nothing.
+    Places,
+}
+
+fn decide(cluster: &mut Cluster, demands: &mut [Demand], depth: Depth) -> Plan {
     demands.sort_by_key(|d| (std::cmp::Reverse(d.spec.priority), d.since));
     let mut plan = Plan::default();
     // A pass only takes, so what had no place for a task has none for one that asks the same.
@@ -119,7 +139,7 @@ pub fn schedule(cluster: &mut Cluster, demands: &mut [Demand]) -> Plan {
             continue;
         }
         let place = choose(cluster, demand);
-        if place.is_none() {
+        if place.is_none() && depth == Depth::Whole {
             if let Some((preemption, why)) = preempt::make_room(cluster, demand) {
                 plan.waits.push(Wait { uid: demand.uid.clone(), why: [why].into() });
                 plan.preemptions.push(preemption);
@@ -138,7 +158,10 @@ pub fn schedule(cluster: &mut Cluster, demands: &mut [Demand]) -> Plan {
                 plan.binds.push(bind);
             }
             None => {
-                let why: Arc<[NodeRefusal]> = summarise(explain(cluster, demand)).into();
+                let why: Arc<[NodeRefusal]> = match depth {
+                    Depth::Whole => summarise(explain(cluster, demand)).into(),
+                    Depth::Places => [].into(),
+                };
                 if hopeless.len() == HOPELESS_KEPT {
                     hopeless.remove(0);
                 }

@@ -55,6 +55,41 @@ fn the_nearest_robot_inside_the_radius_is_taken_and_its_score_is_the_distance() 
 }
 
 #[test]
+fn a_live_pose_counts_until_the_node_is_gone_whatever_its_object_says() {
+    let object = node(Robot, 1000, Some((50.0, 0.0)));
+    let mut cluster = cluster(&[("robot", object.clone())]);
+    let near = json!({"placement": {"at": {"x": 0.0, "y": 0.0}, "within": 5.0}, "resources": {"sensors": ["kinect:ImageGen"]}});
+    let mut demands = [demand("t", near)];
+    assert!(schedule_moved(&mut cluster, &mut demands).is_empty(), "it is 50 m away");
+    let pose = |x| node(Robot, 0, Some((x, 0.0))).status.and_then(|s| s.pose).expect("it has one");
+    cluster.set_pose(&name("robot"), &pose(4.0));
+    // The object changed for another reason, and its checkpoint is old.
+    cluster.upsert_node(&name("robot"), &object);
+    let binds = schedule_moved(&mut cluster, &mut demands);
+    assert_eq!(binds.iter().map(|b| b.score).collect::<Vec<_>>(), [Some(4.0)]);
+    cluster.release(&TaskUid::new("t"));
+    cluster.remove_node(&name("robot"));
+    cluster.set_pose(&name("robot"), &pose(4.0));
+    cluster.upsert_node(&name("robot"), &object);
+    assert!(schedule_moved(&mut cluster, &mut demands).is_empty(), "it joined anew, 50 m away");
+}
+
+#[test]
+fn a_robot_that_is_lost_is_more_than_a_move() {
+    let mut cluster = cluster(&[("robot", node(Robot, 1000, Some((1.0, 0.0))))]);
+    let mut pose = node(Robot, 0, Some((2.0, 0.0))).status.and_then(|s| s.pose).expect("one");
+    drop(cluster.take_changes());
+    cluster.set_pose(&name("robot"), &pose);
+    let (changed, moved) = cluster.take_changes();
+    assert_eq!((changed.len(), moved.len()), (0, 1));
+    pose.localized = false;
+    cluster.set_pose(&name("robot"), &pose);
+    let (changed, moved) = cluster.take_changes();
+    assert_eq!((changed.len(), moved.len()), (1, 1));
+    assert_eq!(cluster.space().nearest("map", pose.position(), 9.0).count(), 0);
+}
+
+#[test]
 fn a_compute_only_task_prefers_the_cloud_and_on_robot_keeps_it_away() {
     let nodes =
         [("robot", node(Robot, 1000, Some((0.0, 0.0)))), ("cloud", node(Cloud, 1000, None))];

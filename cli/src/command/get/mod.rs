@@ -1,5 +1,7 @@
 //! `muster get`: objects as tables or in a format for programs; with `-w`, as they change.
 
+mod poses;
+
 use std::collections::BTreeMap;
 
 use muster_api::kind::KindInfo;
@@ -17,7 +19,7 @@ use crate::watch::{Change, Follow};
 /// `muster get`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
-    /// KIND [NAME…], KIND/NAME…, or all
+    /// KIND [NAME…], KIND/NAME…, all, or poses [NODE…]: where robots are now
     #[arg(value_name = "OBJECT", required = true)]
     objects: Vec<String>,
     /// How to print them
@@ -37,6 +39,9 @@ pub(crate) struct Args {
 }
 
 pub(crate) async fn run(args: Args, session: &mut Session) -> Outcome {
+    if let Some(nodes) = poses::asked(&args.objects)? {
+        return poses::run(&args, nodes, session).await;
+    }
     let named = target::parse(&args.objects)?;
     let by_name = named.iter().any(|n| n.name.is_some());
     if by_name && !args.select.selection().is_empty() {
