@@ -24,6 +24,8 @@ pub struct Reservation {
     pub compute: Compute,
     /// Conflict groups of actuators.
     pub groups: Vec<String>,
+    /// Tasks of the namespace with the same word are not on the same node.
+    pub apart: Option<Arc<str>>,
 }
 
 /// A conflict group of a robot's actuators.
@@ -206,6 +208,7 @@ mod tests {
             title: "default/t".into(),
             compute: Compute::new(MilliCpu(cpu), Bytes(0)),
             groups: groups.iter().map(|g| (*g).to_owned()).collect(),
+            apart: None,
         }
     }
 

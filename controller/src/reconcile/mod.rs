@@ -8,6 +8,7 @@
 //! | [`failover`] | Frameworks | removes those that stay away, writes their numbers |
 //! | [`books`] | the scheduler's ledger | writes used, free and leases into Node status |
 //! | [`health`] | heartbeats | marks silent nodes and their tasks |
+//! | [`taskset`] | TaskSets, their tasks, nodes | begins and ends tasks, changes them, goes back |
 //! | [`deletion`] | Tasks being deleted | removes those whose processes are gone |
 //! | [`garbage`] | ownerReferences | deletes what lost its owner |
 //! | [`history`] | Events, the store's history | forgets what is old |
@@ -21,6 +22,7 @@ pub mod garbage;
 pub mod health;
 pub mod history;
 pub mod schedule;
+pub mod taskset;
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -62,6 +64,7 @@ pub fn spawn(context: &Arc<Context>, sessions: &Arc<Sessions>, tasks: &TaskTrack
     run("health", Box::pin(health::run(Arc::clone(context), Arc::clone(sessions))));
     run("deletion", Box::pin(deletion::run(Arc::clone(context))));
     run("garbage", Box::pin(garbage::run(Arc::clone(context))));
+    run("taskset", Box::pin(taskset::run(Arc::clone(context))));
     run("history", Box::pin(history::run(Arc::clone(context))));
     run("board", Box::pin(crate::session::board::run(Arc::clone(context), Arc::clone(sessions))));
     Reconcilers { scheduler: handle }

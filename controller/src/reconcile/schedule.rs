@@ -306,11 +306,12 @@ impl Scheduler {
                 let title =
                     format!("{}/{}", stored.key.namespace().unwrap_or_default(), stored.key.name);
                 let compute = task.spec.resources.reserved();
+                let apart = task.spec.placement.apart.map(Into::into);
                 // Which groups it holds is said by the Lease objects.
                 self.cluster.book(
                     &uid,
                     &node,
-                    Reservation { title: title.into(), compute, groups: Vec::new() },
+                    Reservation { title: title.into(), compute, groups: Vec::new(), apart },
                 );
                 self.dirty.insert(node);
             }

@@ -79,6 +79,8 @@ pub enum Subresource {
     Why,
     /// `…/fence`
     Fence,
+    /// `…/scale`
+    Scale,
 }
 
 /// One object, or a collection when `name` is `None`.
@@ -102,6 +104,7 @@ impl Object {
         match self.subresource {
             Some(Subresource::Log | Subresource::Why) => verb == Verb::Get,
             Some(Subresource::Fence) => verb == Verb::Create,
+            Some(Subresource::Scale) => matches!(verb, Verb::Get | Verb::Update | Verb::Patch),
             Some(Subresource::Status) => {
                 self.entry.info.has_status
                     && (verb == Verb::Get
@@ -238,6 +241,7 @@ fn object(group: &str, parts: &[&str]) -> Option<Object> {
         Some("log") if entry.has_log => Some(Subresource::Log),
         Some("why") if entry.has_why => Some(Subresource::Why),
         Some("fence") if entry.info.kind == "Node" => Some(Subresource::Fence),
+        Some("scale") if entry.info.kind == "TaskSet" => Some(Subresource::Scale),
         Some(_) => return None,
     };
     // An object of a namespaced kind has no path outside its namespace.
@@ -291,6 +295,12 @@ mod tests {
                 "create nodes ns=None name=Some(\"n\") sub=Some(Fence)",
             ),
             ("POST", format!("{g}/namespaces/a/tasks/t/fence"), "404"),
+            ("GET", format!("{g}/namespaces/a/tasks/t/scale"), "404"),
+            (
+                "PATCH",
+                format!("{g}/namespaces/a/tasksets/t/scale"),
+                "patch tasksets ns=Some(\"a\") name=Some(\"t\") sub=Some(Scale)",
+            ),
             ("DELETE", format!("{g}/nodes"), "deletecollection nodes ns=None name=None sub=None"),
             ("GET", "/api/v1/namespaces".into(), "list namespaces ns=None name=None sub=None"),
             (
