@@ -8,3 +8,4 @@ mod frameworks;
 mod lease;
 mod quotas;
 mod survival;
+mod tasksets;

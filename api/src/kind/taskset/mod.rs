@@ -14,7 +14,7 @@ use std::collections::BTreeMap;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::MicroTime;
 use kube::CustomResource;
 use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
+use serde::{Deserialize, Deserializer, Serialize, de};
 
 use super::KindInfo;
 use super::task::TaskSpec;
@@ -94,7 +94,15 @@ pub struct TaskTemplate {
     #[serde(default, skip_serializing_if = "TemplateMetadata::is_empty")]
     pub metadata: TemplateMetadata,
     /// Their spec. `restartPolicy` is Always, and is when it is left out.
+    #[serde(deserialize_with = "always_restarted")]
     pub spec: TaskSpec,
+}
+
+/// A task's spec whose restart policy, when it is left out, is Always, as in a Kubernetes template.
+fn always_restarted<'de, D: Deserializer<'de>>(d: D) -> Result<TaskSpec, D::Error> {
+    let mut spec = serde_json::Map::deserialize(d)?;
+    spec.entry("restartPolicy").or_insert_with(|| "Always".into());
+    serde_json::from_value(spec.into()).map_err(de::Error::custom)
 }
 
 /// What of a task's metadata a template may set.

@@ -17,11 +17,6 @@ pub(super) fn admit_body(object: &mut Value, violations: &mut Violations) {
             )
             .suggest("the names of its tasks and revisions begin with it and are longer");
     }
-    // As in a Kubernetes template, where what is left out is Always.
-    let template = object.pointer_mut("/spec/template/spec").and_then(Value::as_object_mut);
-    if let Some(spec) = template {
-        spec.entry("restartPolicy").or_insert_with(|| "Always".into());
-    }
     admit_spec::<TaskSetSpec>(object, violations, rules);
 }
 

@@ -68,7 +68,15 @@ fn apart(member: &Member, demand: &Demand) -> Option<Refusal> {
 /// What of a node stands against a task for as long as both are what they are: not what is busy, lost or cordoned now.
 #[must_use]
 pub fn unsuited(name: &str, facts: &NodeFacts, spec: &TaskSpec) -> Option<Refusal> {
-    identity(name, facts, spec).or_else(|| abilities(facts, spec)).or_else(|| tainted(facts, spec))
+    let resources = &spec.resources;
+    let joined = || {
+        let message = "its agent has not joined".to_owned();
+        facts.runtimes.is_empty().then_some(Refusal::NotReady { message })
+    };
+    identity(name, facts, spec)
+        .or_else(joined)
+        .or_else(|| functions(facts, &resources.sensors, &resources.actuators))
+        .or_else(|| tainted(facts, spec))
 }
 
 fn abilities(facts: &NodeFacts, spec: &TaskSpec) -> Option<Refusal> {

@@ -139,9 +139,6 @@ pub fn fault(
 /// It waits for something that its template has nothing to do with: a first place, or a node that takes nothing now.
 #[must_use]
 pub fn is_excused(task: &TaskView, node: Option<&NodeView>) -> bool {
-    task.phase == TaskPhase::Pending
-        && match node {
-            Some(node) => node.is_shut(),
-            None => task.prefer.is_none(),
-        }
+    let first = task.prefer.is_none();
+    task.phase == TaskPhase::Pending && (first || node.is_none_or(NodeView::is_shut))
 }

@@ -144,6 +144,8 @@ pub struct NewTask {
     pub revision: String,
     /// Where.
     pub place: Place,
+    /// A task of the set ran there before.
+    pub follows: bool,
 }
 
 /// Where a new task goes.

@@ -220,7 +220,11 @@ pub(super) fn shrink(snapshot: &Snapshot<'_>, crew: &Crew<'_>, course: &Course, 
                             end(member, Ending::TooMany);
                         }
                     }
-                    place => drop(end(member, why_not(snapshot, place))),
+                    place => match why_not(snapshot, place) {
+                        // As its effect says: nothing new goes there.
+                        Ending::Unsuited(Refusal::Tainted { .. }) => {}
+                        why => drop(end(member, why)),
+                    },
                 }
             }
         }
@@ -297,7 +301,8 @@ pub(super) fn fill(snapshot: &Snapshot<'_>, crew: &Crew<'_>, course: &Course, pl
             _ => course.base.clone(),
         };
         plan.status.replacing.retain(|r| before.is_none_or(|b| *r != *b));
-        plan.actions.push(Action::Create(NewTask { name, revision, place }));
+        let follows = before.is_some();
+        plan.actions.push(Action::Create(NewTask { name, revision, place, follows }));
     }
     if all {
         // What is still empty is not wanted any more.

@@ -47,11 +47,11 @@ pub(super) fn decide(
     };
     let is_new = history.good.as_ref().is_some_and(|good| good != target);
     let forward = is_new && rollout.strategy == Strategy::Rolling;
-    let fault = first_fault(snapshot, crew, target, now, plan);
+    // Where a fault means the way back, one that is over counts as well.
+    let strict = forward && rollout.auto_rollback && !rollout.paused;
+    let fault = first_fault(snapshot, crew, (target, strict), now, plan);
     match (&fault, &history.good) {
-        (Some((task, fault)), Some(good))
-            if forward && rollout.auto_rollback && !rollout.paused =>
-        {
+        (Some((task, fault)), Some(good)) if strict => {
             give_up(target, good, (task, fault), now, plan);
             course(snapshot, crew, good, None, plan)
         }
@@ -70,14 +70,15 @@ pub(super) fn decide(
 fn first_fault(
     snapshot: &Snapshot<'_>,
     crew: &Crew<'_>,
-    target: &str,
+    (target, strict): (&str, bool),
     now: Timestamp,
     plan: &mut Plan,
 ) -> Option<(String, Fault)> {
     let deadline = Duration::from_secs(snapshot.spec.rollout.progress_deadline_seconds.into());
     let mut first = None;
-    for Member { task, .. } in crew.live.iter().chain(&crew.ended) {
-        if task.revision != target {
+    for member in crew.live.iter().chain(&crew.ended) {
+        let task = member.task;
+        if task.revision != target || (member.is_available() && !strict) {
             continue;
         }
         if let Some(fault) = fault(task, crew.node(task), deadline, now) {
@@ -223,8 +224,8 @@ fn is_settled(
         Action::Delete { why, .. } => matches!(why, Ending::Outdated { .. } | Ending::Over),
         _ => false,
     });
-    if busy || !plan.status.replacing.is_empty() || !crew.ended.is_empty() || course.fault.is_some()
-    {
+    let failed = course.forward && course.fault.is_some();
+    if busy || failed || !plan.status.replacing.is_empty() || !crew.ended.is_empty() {
         return false;
     }
     let deadline = Duration::from_secs(snapshot.spec.rollout.progress_deadline_seconds.into());
@@ -246,5 +247,6 @@ fn is_settled(
         }
         available += usize::from(is_new && member.is_available());
     }
-    available >= course.canaries.max(1) || crew.wanted() == 0 && crew.live.is_empty()
+    // Where nothing runs, nothing is proved.
+    available >= course.canaries.max(1)
 }

@@ -192,7 +192,10 @@ impl Work<'_> {
         match &new.place {
             Place::Anywhere => {}
             Place::Prefer(node) => placement.prefer = Some(node.clone()),
-            Place::Only(node) => placement.node = Some(node.clone()),
+            Place::Only(node) => {
+                placement.node = Some(node.clone());
+                placement.prefer = new.follows.then(|| node.clone());
+            }
         }
         if self.set.spec.spread && !self.set.spec.every_node {
             placement.apart.get_or_insert_with(|| set.to_owned());

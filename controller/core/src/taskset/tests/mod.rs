@@ -240,7 +240,12 @@ fn paused_changes_nothing_and_still_counts() {
 #[test]
 fn a_task_of_nobody_is_taken_in_and_one_that_changed_its_labels_let_go() {
     let mut world = three();
-    let stray = NewTask { name: "stray".to_owned(), revision: String::new(), place: Place::Anywhere };
+    let stray = NewTask {
+        name: "stray".to_owned(),
+        revision: String::new(),
+        place: Place::Anywhere,
+        follows: false,
+    };
     let mut stray = world.new_task(&stray);
     stray.claim = Claim::Nobodys;
     world.tasks.push(stray);
@@ -281,4 +286,47 @@ fn old_templates_are_forgotten_beyond_the_limit() {
         world.settle();
     }
     assert_eq!(world.revisions.len(), 2, "what is, and one before");
+}
+
+#[test]
+fn a_first_rollout_counts_although_a_task_crashed_once() {
+    let mut world = World::new(json!({"replicas": 1}), 2);
+    world.steps(3);
+    let task = world.task("set-0");
+    (task.attempt, task.exited) = (2, true);
+    world.settle();
+    assert_eq!(world.progressing().0, "Complete");
+    assert_eq!(world.status.current_revision, world.status.update_revision);
+}
+
+#[test]
+fn a_node_that_takes_no_first_task_ends_no_rollout_and_a_taint_ends_no_task() {
+    let mut world = World::new(json!({"everyNode": true, "rollout": {"progressDeadlineSeconds": 20, "maxUnavailable": 2}}), 2);
+    world.settle();
+    world.set_template(1);
+    world.step();
+    world.join("r9");
+    world.node("r9").facts.unschedulable = true;
+    world.steps(3);
+    world.settle();
+    assert_eq!(world.status.rolled_back_from, None);
+    assert_eq!(world.status.current_revision, world.status.update_revision);
+    let taint = json!([{"key": "busy", "effect": "NoSchedule"}]);
+    world.node("r0").facts.taints = serde_json::from_value(taint).expect("taints");
+    world.settle();
+    assert_eq!(world.tasks.len(), 3, "nothing new, and nothing less");
+}
+
+#[test]
+fn a_template_that_never_served_is_never_called_good() {
+    let mut world = World::new(json!({"replicas": 0, "rollout": {"canary": 0}}), 4);
+    world.decide();
+    world.set_template(2);
+    world.decide();
+    world.spec.replicas = Some(1);
+    world.decide();
+    for _ in 0..90 {
+        world.step();
+        assert_eq!(world.status.current_revision, "", "{:#?} {:#?}", world.tasks, world.status);
+    }
 }

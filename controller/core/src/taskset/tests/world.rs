@@ -351,7 +351,8 @@ impl World {
             },
             prefer: match &new.place {
                 Place::Prefer(node) => Some(node.clone()),
-                _ => None,
+                Place::Only(node) => new.follows.then(|| node.clone()),
+                Place::Anywhere => None,
             },
             score: None,
             created: self.now,
