@@ -52,11 +52,8 @@ pub(crate) async fn run(args: Args, session: &mut Session) -> Outcome {
     for doomed in &tasks {
         let name = name(&doomed.object);
         let namespace = doomed.namespace.as_deref();
-        let how = Deletion {
-            grace: args.grace_period,
-            uid: Some(&doomed.uid),
-            ..Deletion::default()
-        };
+        let how =
+            Deletion { grace: args.grace_period, uid: Some(&doomed.uid), ..Deletion::default() };
         let deleted = session.client.delete(doomed.info, namespace, &name, how);
         match deleted.await {
             Ok(_) => {}

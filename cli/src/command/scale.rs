@@ -45,7 +45,9 @@ async fn scale(named: &Named<'_>, args: &Args, session: &mut Session) -> Result<
         if is != u64::from(expected) {
             return Err(CliError::Failed {
                 what: format!("taskset/{name} should have {is} tasks, not {expected}"),
-                hint: Some("it is not scaled; leave --current-replicas out to do it anyway".to_owned()),
+                hint: Some(
+                    "it is not scaled; leave --current-replicas out to do it anyway".to_owned(),
+                ),
             });
         }
         patch["metadata"] = json!({"resourceVersion": present["metadata"]["resourceVersion"]});

@@ -166,7 +166,10 @@ async fn a_set_is_scaled_as_kubectl_does_it() {
     let path = format!("{SETS}/some/scale");
     cluster.until(&path, |scale| scale["status"]["replicas"] == 2).await;
     let (code, scale) = get(&admin, &path).await;
-    assert_eq!((code, &scale["kind"], &scale["apiVersion"]), (200, &"Scale".into(), &"autoscaling/v1".into()));
+    assert_eq!(
+        (code, &scale["kind"], &scale["apiVersion"]),
+        (200, &"Scale".into(), &"autoscaling/v1".into())
+    );
     assert_eq!(scale["status"]["selector"], "muster.dev/taskset=some");
 
     let (code, patched) = send(&admin, "PATCH", &path, json!({"spec": {"replicas": 3}})).await;

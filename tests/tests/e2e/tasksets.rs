@@ -48,7 +48,8 @@ fn says(status: &TaskSetStatus, reason: &str) -> bool {
 }
 
 async fn complete(cluster: &Cluster, name: &str, tasks: u32) -> TaskSetStatus {
-    status(cluster, name, "complete", |s| says(s, "Complete") && s.available_replicas == tasks).await
+    status(cluster, name, "complete", |s| says(s, "Complete") && s.available_replicas == tasks)
+        .await
 }
 
 /// The processes of a set's tasks, by node.
@@ -119,7 +120,10 @@ async fn the_nearest_robots_have_one_each_and_a_set_takes_its_tasks_with_it() {
     let row: Vec<&str> = table.lines().nth(1).expect("a row").split_whitespace().collect();
     assert_eq!(row[..6], ["watch", "1", "1", "1", "1", "Complete"], "{table}");
     let (_, described, _) = muster(&cluster, &["describe", "taskset/watch"]);
-    assert!(described.contains("each on a node of its own") && described.contains("near"), "{described}");
+    assert!(
+        described.contains("each on a node of its own") && described.contains("near"),
+        "{described}"
+    );
 
     assert_eq!(muster(&cluster, &["delete", "taskset", "watch"]).0, 0);
     wait::until("gone with its tasks", || async {
@@ -166,7 +170,10 @@ async fn a_rollout_that_crashes_goes_back_a_mission_is_waited_for_and_undo_undoe
     })
     .await;
     let why = back.rolled_back_from.expect("it was given up");
-    assert_eq!((why.reason.as_str(), why.to.as_str()), ("Crashed", first.current_revision.as_str()));
+    assert_eq!(
+        (why.reason.as_str(), why.to.as_str()),
+        ("Crashed", first.current_revision.as_str())
+    );
     assert!(why.message.contains("exited with code 7"), "{}", why.message);
     let after = processes(&cluster).await;
     let same = before.iter().filter(|(node, pids)| after[*node] == **pids).count();
@@ -194,7 +201,10 @@ async fn a_rollout_that_crashes_goes_back_a_mission_is_waited_for_and_undo_undoe
     assert!(out.ends_with("taskset \"watch\" successfully rolled out\n"), "{out}");
     assert_ne!(processes(&cluster).await["far"], after["far"]);
 
-    assert_eq!(muster(&cluster, &["rollout", "undo", "ts/watch", "--to-revision=1"]).1, "taskset/watch rolled back\n");
+    assert_eq!(
+        muster(&cluster, &["rollout", "undo", "ts/watch", "--to-revision=1"]).1,
+        "taskset/watch rolled back\n"
+    );
     let undone = complete(&cluster, "watch", 3).await;
     assert_eq!(undone.current_revision, first.current_revision);
     for task in cluster.tasks().await.list(&Default::default()).await.expect("a list") {

@@ -46,7 +46,10 @@ pub(super) fn rules(spec: &TaskSetSpec, violations: &mut Violations) {
         violations
             .invalid(
                 "spec.rollout.progressDeadlineSeconds",
-                format!("{} passes before a task can be available", rollout.progress_deadline_seconds),
+                format!(
+                    "{} passes before a task can be available",
+                    rollout.progress_deadline_seconds
+                ),
             )
             .suggest(format!("more than minReadySeconds, {}", spec.min_ready_seconds));
     }
@@ -109,8 +112,7 @@ fn template_rules(spec: &TaskSetSpec, violations: &mut Violations) {
     if !spec.every_node {
         return;
     }
-    let given =
-        [("at", placement.at.is_some()), ("node", placement.node.is_some())];
+    let given = [("at", placement.at.is_some()), ("node", placement.node.is_some())];
     for (field, _) in given.into_iter().filter(|(_, given)| *given) {
         violations
             .forbidden(

@@ -35,7 +35,10 @@ pub(super) fn describe(sheet: &mut Sheet, set: &TaskSet, tasks: &[Task], now: Ti
         "Tasks",
         format!(
             "{} are, {} updated, {} ready, {} available",
-            status.replicas, status.updated_replicas, status.ready_replicas, status.available_replicas
+            status.replicas,
+            status.updated_replicas,
+            status.ready_replicas,
+            status.available_replicas
         ),
     );
     rollout(sheet, &set.spec.rollout);

@@ -140,7 +140,9 @@ async fn undo(args: UndoArgs, session: &mut Session) -> Outcome {
     let change = three_way(Some(&current), &template, &current);
     if change.as_object().is_some_and(serde_json::Map::is_empty) {
         let number = wanted.spec.revision;
-        session.ui.line(&format!("taskset/{name} skipped rollback (revision {number} is what it has)"))?;
+        session
+            .ui
+            .line(&format!("taskset/{name} skipped rollback (revision {number} is what it has)"))?;
         return Ok(exit::OK);
     }
     let patch = json!({"spec": {"template": change}});
@@ -200,8 +202,11 @@ mod tests {
 
     fn fake() -> Fake {
         let fake = Fake::new();
-        let mut set = taskset("x", json!({"updateRevision": "x-b", "currentRevision": "x-a",
-            "rolledBackFrom": {"revision": "x-b", "to": "x-a", "reason": "Crashed", "message": "m", "at": "2026-01-02T03:04:05Z"}}));
+        let mut set = taskset(
+            "x",
+            json!({"updateRevision": "x-b", "currentRevision": "x-a",
+            "rolledBackFrom": {"revision": "x-b", "to": "x-a", "reason": "Crashed", "message": "m", "at": "2026-01-02T03:04:05Z"}}),
+        );
         set["metadata"]["uid"] = "u".into();
         set["spec"]["template"] = revision("x-b", 2, "new")["spec"]["template"].clone();
         set["spec"]["template"]["metadata"] = json!({"annotations": {"a": "b"}});
@@ -216,7 +221,8 @@ mod tests {
         let fake = fake();
         let done = fake.run(&["rollout", "undo", "ts/x"]).await;
         assert_eq!(done, (exit::OK, "taskset/x rolled back\n".to_owned()));
-        let template = fake.object("tasksets/default/x").expect("there")["spec"]["template"].clone();
+        let template =
+            fake.object("tasksets/default/x").expect("there")["spec"]["template"].clone();
         assert_eq!(template["spec"]["run"]["process"]["command"], json!(["old"]));
         assert_eq!(template.get("metadata"), None, "what only the new one said is gone");
         let again = fake.run(&["rollout", "undo", "x", "--to-revision=1"]).await.1;
@@ -229,7 +235,9 @@ mod tests {
     async fn pause_resume_and_restart() {
         let fake = fake();
         assert_eq!(fake.run(&["rollout", "pause", "ts/x"]).await.1, "taskset/x paused\n");
-        for line in [["rollout", "pause", "ts/x"], ["rollout", "restart", "x"], ["rollout", "undo", "x"]] {
+        for line in
+            [["rollout", "pause", "ts/x"], ["rollout", "restart", "x"], ["rollout", "undo", "x"]]
+        {
             let error = fake.try_run(&line).await.expect_err("paused");
             assert_eq!(error.class().exit(), exit::FAILURE);
         }
@@ -253,6 +261,9 @@ mod tests {
              2          x-b    to new         template, given up\n"
         );
         let (_, text) = fake.run(&["rollout", "history", "ts/x", "--revision=1"]).await;
-        assert!(text.starts_with("taskset/x with revision #1\n") && text.contains("- old"), "{text}");
+        assert!(
+            text.starts_with("taskset/x with revision #1\n") && text.contains("- old"),
+            "{text}"
+        );
     }
 }

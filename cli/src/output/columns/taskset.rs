@@ -77,7 +77,8 @@ mod tests {
             "conditions": [{"type": "Progressing", "status": "True", "reason": "Canary"}],
         });
         assert_eq!(
-            table(info, &[taskset("a", status), taskset("b", json!(null))], layout).text(&Styles::default()),
+            table(info, &[taskset("a", status), taskset("b", json!(null))], layout)
+                .text(&Styles::default()),
             "NAME   DESIRED   CURRENT   UPDATED   AVAILABLE   ROLLOUT   AGE\n\
              a      3         3         1         2           Canary    -\n\
              b      3         -         -         -           -         -\n"

@@ -59,9 +59,10 @@ fn executor(member: &Member, demand: &Demand) -> Option<Refusal> {
 fn apart(member: &Member, demand: &Demand) -> Option<Refusal> {
     let word = demand.spec.placement.apart.as_deref()?;
     let namespace = namespace_of(&demand.title);
-    let here = member.ledger.reservations().find(|(_, r)| {
-        r.apart.as_deref() == Some(word) && namespace_of(&r.title) == namespace
-    });
+    let here = member
+        .ledger
+        .reservations()
+        .find(|(_, r)| r.apart.as_deref() == Some(word) && namespace_of(&r.title) == namespace);
     here.map(|(_, r)| Refusal::Apart { task: r.title.to_string() })
 }
 

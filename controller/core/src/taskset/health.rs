@@ -124,7 +124,7 @@ pub fn fault(
         Starting | Running if task.attempt > 1 && task.exited => return crashed(),
         Starting | Running | Bound | Pending => {}
     }
-    if is_excused(task, node) || after(task.created, deadline) > now {
+    if is_excused(task) || due(task, node, deadline) > now {
         return None;
     }
     let deadline = deadline.as_secs();
@@ -136,9 +136,19 @@ pub fn fault(
     }
 }
 
-/// It waits for something that its template has nothing to do with: a first place, or a node that takes nothing now.
+/// Until when a task has time to become available. While its node could not be reached it had none.
 #[must_use]
-pub fn is_excused(task: &TaskView, node: Option<&NodeView>) -> bool {
-    let first = task.prefer.is_none();
-    task.phase == TaskPhase::Pending && (first || node.is_none_or(NodeView::is_shut))
+pub fn due(task: &TaskView, node: Option<&NodeView>, deadline: Duration) -> Timestamp {
+    let begun = task.bound.unwrap_or(task.created);
+    after(node.and_then(|n| n.ready_since).map_or(begun, |ready| ready.max(begun)), deadline)
+}
+
+/// Refusals that a template has nothing to do with.
+const NOT_ITS_WISH: [&str; 4] = ["NotReady", "Cordoned", "LeaseHeld", "Apart"];
+
+/// It waits for something that its template has nothing to do with: a first place, or a node that was taken from it.
+#[must_use]
+pub fn is_excused(task: &TaskView) -> bool {
+    let blamed = task.refusal.as_ref().is_some_and(|r| !NOT_ITS_WISH.contains(&r.as_str()));
+    task.phase == TaskPhase::Pending && !blamed
 }

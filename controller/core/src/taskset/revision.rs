@@ -64,7 +64,12 @@ pub(super) fn forget(snapshot: &Snapshot<'_>, course: &Course, plan: &mut Plan) 
         .map(|t| t.revision.as_str())
         .chain(status.replacing.iter().map(|r| r.revision.as_str()))
         .chain(status.rolled_back_from.iter().map(|b| b.revision.as_str()))
-        .chain([&*status.current_revision, &*status.update_revision, &*course.target, &*course.base])
+        .chain([
+            &*status.current_revision,
+            &*status.update_revision,
+            &*course.target,
+            &*course.base,
+        ])
         .collect();
     let mut old: Vec<&RevisionView> =
         snapshot.revisions.iter().filter(|r| !used.contains(r.name.as_str())).collect();

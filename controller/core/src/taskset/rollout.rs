@@ -7,7 +7,7 @@ use jiff::Timestamp;
 use muster_api::kind::taskset::{Replacing, RolledBack, Strategy};
 use muster_api::phase::TaskPhase;
 
-use super::health::{Fault, fault, is_excused};
+use super::health::{Fault, due, fault, is_excused};
 use super::places::{Crew, Member};
 use super::revision::History;
 use super::{Action, Ending, News, Plan, Snapshot, after};
@@ -81,10 +81,11 @@ fn first_fault(
         if task.revision != target || (member.is_available() && !strict) {
             continue;
         }
-        if let Some(fault) = fault(task, crew.node(task), deadline, now) {
+        let node = crew.node(task);
+        if let Some(fault) = fault(task, node, deadline, now) {
             first.get_or_insert((task.name.clone(), fault));
         }
-        let due = after(task.created, deadline);
+        let due = due(task, node, deadline);
         if due > now && (task.phase != TaskPhase::Running || task.ready == Some(false)) {
             plan.look_at(Some(due));
         }
@@ -202,7 +203,8 @@ pub(super) fn conclude(
     now: Timestamp,
     plan: &mut Plan,
 ) {
-    if plan.status.current_revision == course.target || !is_settled(snapshot, crew, course, now, plan)
+    if plan.status.current_revision == course.target
+        || !is_settled(snapshot, crew, course, now, plan)
     {
         return;
     }
@@ -239,7 +241,7 @@ fn is_settled(
                 plan.look_at(Some(after(since, deadline)).filter(|due| *due > now));
                 after(since, deadline) <= now
             }
-            _ if is_new => member.is_available() || is_excused(task, crew.node(task)),
+            _ if is_new => member.is_available() || is_excused(task),
             _ => crew.held(task).is_some(),
         };
         if !is_done {

@@ -26,7 +26,8 @@ pub type Conditions = Vec<Said>;
 /// Writes the numbers as they are before the plan's own actions, and what can be said about them.
 pub(super) fn write(snapshot: &Snapshot<'_>, crew: &Crew<'_>, course: &Course, plan: &mut Plan) {
     let stays: Vec<&Member<'_>> = crew.live.iter().filter(|m| !plan.ends(m.task)).collect();
-    let count = |holds: &dyn Fn(&Member<'_>) -> bool| number(stays.iter().filter(|m| holds(m)).count());
+    let count =
+        |holds: &dyn Fn(&Member<'_>) -> bool| number(stays.iter().filter(|m| holds(m)).count());
     let available = count(&|m| m.is_available());
     let (replicas, ready) = (count(&|_| true), count(&|m| m.health != Health::NotReady));
     let updated = count(&|m| m.task.revision == plan.status.update_revision);
@@ -36,7 +37,8 @@ pub(super) fn write(snapshot: &Snapshot<'_>, crew: &Crew<'_>, course: &Course, p
     status.observed_generation = snapshot.generation;
     status.selector = snapshot.spec.selects(snapshot.name).to_string();
     status.desired_replicas = number(crew.wanted());
-    (status.replicas, status.ready_replicas, status.available_replicas) = (replicas, ready, available);
+    (status.replicas, status.ready_replicas, status.available_replicas) =
+        (replicas, ready, available);
     (status.updated_replicas, status.unavailable_replicas) = (updated, down);
     let most = snapshot.spec.rollout.max_unavailable.of(crew.wanted());
     plan.conditions = vec![
@@ -60,15 +62,18 @@ fn enough(desired: u32, available: u32, too_few: bool) -> Said {
 
 /// `arrived`: tasks of the revision that all should be of.
 fn progress(snapshot: &Snapshot<'_>, course: &Course, plan: &Plan, arrived: u32) -> Said {
-    let say = |status, reason, message: String| Said { condition: PROGRESSING, status, reason, message };
+    let say =
+        |status, reason, message: String| Said { condition: PROGRESSING, status, reason, message };
     let status = &plan.status;
     let desired = status.desired_replicas;
     let behind = arrived < desired || status.replicas > arrived;
     let still = status.available_replicas < desired;
     let paused = snapshot.spec.rollout.paused;
     if let Some(back) = &status.rolled_back_from {
-        let so_far = if behind { format!(", {arrived} of {desired} are back") } else { String::new() };
-        let message = format!("{} was given up for {}: {}{so_far}", back.revision, back.to, back.message);
+        let so_far =
+            if behind { format!(", {arrived} of {desired} are back") } else { String::new() };
+        let message =
+            format!("{} was given up for {}: {}{so_far}", back.revision, back.to, back.message);
         return say(ConditionStatus::False, "RolledBack", message);
     }
     if let Some((task, fault)) = course.fault.as_ref().filter(|_| course.forward || still) {

@@ -45,6 +45,10 @@ pub struct TaskView {
     pub score: Option<f64>,
     /// When it was created, by the controller's clock.
     pub created: Timestamp,
+    /// When it was placed, by the controller's clock.
+    pub bound: Option<Timestamp>,
+    /// Why the node that it follows another on does not take it, one word.
+    pub refusal: Option<String>,
     /// When its attempt began, by the clock of its node.
     pub started: Option<Timestamp>,
     /// When its last attempt ended, by the clock of its node.
@@ -80,6 +84,8 @@ impl TaskView {
         };
         let status = task.status.clone().unwrap_or_default();
         let placement = &task.spec.placement;
+        let refusal = status.why.iter().find(|w| Some(&w.node) == placement.prefer.as_ref());
+        let refusal = refusal.map(|w| w.reason.clone());
         Some(TaskView {
             name: task.metadata.name.clone()?,
             claim,
@@ -90,6 +96,8 @@ impl TaskView {
             prefer: placement.prefer.clone(),
             score: status.score,
             created: task.metadata.creation_timestamp.as_ref()?.0,
+            bound: status.bound_at.map(|t| t.0),
+            refusal,
             started: status.started_at.map(|t| t.0),
             finished: status.finished_at.map(|t| t.0),
             attempt: status.attempt,
@@ -124,6 +132,8 @@ pub struct NodeView {
     pub lock: Option<MissionLock>,
     /// Since when its agent is not heard.
     pub silent_since: Option<Timestamp>,
+    /// Since when it is ready.
+    pub ready_since: Option<Timestamp>,
 }
 
 impl NodeView {
@@ -131,21 +141,19 @@ impl NodeView {
     #[must_use]
     pub fn of(node: &Node) -> Self {
         let ready = node.status.as_ref().and_then(|s| s.condition(READY));
-        let silent = ready.filter(|c| c.status == ConditionStatus::Unknown);
+        let since = |status: ConditionStatus| {
+            let condition = ready.filter(|c| c.status == status);
+            condition.and_then(|c| c.last_transition_time.as_ref()).map(|t| t.0)
+        };
         let mut facts = NodeFacts::of(node);
         // Where it is moves all the time, and no set asks for it.
         facts.pose = None;
         NodeView {
             facts,
             lock: node.mission_lock(),
-            silent_since: silent.and_then(|c| c.last_transition_time.as_ref()).map(|t| t.0),
+            silent_since: since(ConditionStatus::Unknown),
+            ready_since: since(ConditionStatus::True),
         }
-    }
-
-    /// A task that waits for this node cannot help it.
-    #[must_use]
-    pub fn is_shut(&self) -> bool {
-        self.facts.unschedulable || self.facts.not_ready.is_some()
     }
 }
 

@@ -174,9 +174,8 @@ impl Index {
         let namespace = set.namespace().unwrap_or_default();
         let first = Key::namespaced(TASKS, namespace, prefix.as_str());
         let same = self.tasks.range(first..).map(|(key, _)| key);
-        let same = same.take_while(|key| {
-            key.namespace() == Some(namespace) && key.name.starts_with(&prefix)
-        });
+        let same = same
+            .take_while(|key| key.namespace() == Some(namespace) && key.name.starts_with(&prefix));
         let others = same.filter(|key| tasks.iter().all(|t| *t.name != *key.name));
         others.map(|key| key.name.to_string()).collect()
     }

@@ -85,14 +85,15 @@ struct Work<'a> {
 impl Work<'_> {
     fn operations(&self, plan: &Plan) -> Result<Vec<Op>, Stop> {
         let mut ops = Vec::new();
-        let creates =
-            |a: &Action| matches!(a, Action::Create(_) | Action::CreateRevision { .. });
+        let creates = |a: &Action| matches!(a, Action::Create(_) | Action::CreateRevision { .. });
         if plan.actions.iter().any(creates) {
             ops.extend(namespace_guard(self.context, TASKS, self.namespace())?);
         }
         for action in &plan.actions {
             match action {
-                Action::CreateRevision { name, number } => ops.push(self.new_revision(name, *number)?),
+                Action::CreateRevision { name, number } => {
+                    ops.push(self.new_revision(name, *number)?)
+                }
                 Action::Renumber { name, number } => {
                     ops.push(self.revision(name, |revision| revision.spec.revision = *number)?);
                 }
@@ -242,7 +243,11 @@ fn tell(context: &Context, set: &TaskSet, plan: &Plan) {
     for action in &plan.actions {
         match action {
             Action::Create(new) => {
-                context.events.set(set, "Created", format!("task {} of {}", new.name, new.revision));
+                context.events.set(
+                    set,
+                    "Created",
+                    format!("task {} of {}", new.name, new.revision),
+                );
             }
             Action::Delete { task, why } => {
                 context.events.set(set, "Ended", format!("task {task}: {why}"));

@@ -214,7 +214,11 @@ fn a_task_that_nobody_can_see_is_waited_for_or_replaced_as_the_set_says() {
 fn a_lost_robot_is_no_reason_to_go_back() {
     let mut world = three_with(json!({"progressDeadlineSeconds": 20, "maxUnavailable": 2}));
     world.set_template(1);
-    while !world.tasks.iter().any(|t| t.phase == TaskPhase::Running && t.attempt == 1 && t.prefer.is_some()) {
+    while !world
+        .tasks
+        .iter()
+        .any(|t| t.phase == TaskPhase::Running && t.attempt == 1 && t.prefer.is_some())
+    {
         world.step();
     }
     let node = world.task("set-0").node.clone().expect("placed");
@@ -253,14 +257,15 @@ fn a_task_of_nobody_is_taken_in_and_one_that_changed_its_labels_let_go() {
     world.decide();
     assert_eq!(
         world.actions,
-        [
-            Action::Release { task: "set-2".to_owned() },
-            Action::Adopt { task: "stray".to_owned() },
-        ]
+        [Action::Release { task: "set-2".to_owned() }, Action::Adopt { task: "stray".to_owned() },]
     );
     world.taken.insert("set-2".to_owned());
     world.settle();
-    assert_eq!(created(&world), ["set-3"], "its own name is another's; the stray was of no revision");
+    assert_eq!(
+        created(&world),
+        ["set-3"],
+        "its own name is another's; the stray was of no revision"
+    );
 }
 
 #[test]
@@ -301,7 +306,10 @@ fn a_first_rollout_counts_although_a_task_crashed_once() {
 
 #[test]
 fn a_node_that_takes_no_first_task_ends_no_rollout_and_a_taint_ends_no_task() {
-    let mut world = World::new(json!({"everyNode": true, "rollout": {"progressDeadlineSeconds": 20, "maxUnavailable": 2}}), 2);
+    let mut world = World::new(
+        json!({"everyNode": true, "rollout": {"progressDeadlineSeconds": 20, "maxUnavailable": 2}}),
+        2,
+    );
     world.settle();
     world.set_template(1);
     world.step();
@@ -328,5 +336,22 @@ fn a_template_that_never_served_is_never_called_good() {
     for _ in 0..90 {
         world.step();
         assert_eq!(world.status.current_revision, "", "{:#?} {:#?}", world.tasks, world.status);
+    }
+}
+
+#[test]
+fn a_template_that_its_robot_cannot_take_ends_the_rollout_and_a_robot_that_others_took_does_not() {
+    for (refusal, reason) in [("TooSmall", "RolledBack"), ("LeaseHeld", "Canary")] {
+        let mut world = three_with(json!({"progressDeadlineSeconds": 20}));
+        world.set_template(1);
+        let names: Vec<String> = world.nodes.keys().cloned().collect();
+        for name in names {
+            world.node(&name).facts.unschedulable = true;
+        }
+        world.steps(4);
+        assert_eq!(world.task("set-0").phase, TaskPhase::Pending);
+        world.task("set-0").refusal = Some(refusal.to_owned());
+        world.steps(20);
+        assert_eq!(world.progressing().0, reason, "{refusal}");
     }
 }

@@ -27,6 +27,11 @@ pub(super) fn template(number: u32) -> TaskTemplate {
     serde_json::from_value(template).expect("a template")
 }
 
+/// It takes nothing now.
+fn is_shut(node: &NodeView) -> bool {
+    node.facts.unschedulable || node.facts.not_ready.is_some()
+}
+
 pub(super) fn is_bad(template: &TaskTemplate) -> bool {
     template.metadata.annotations["kind"] == "bad"
 }
@@ -89,6 +94,7 @@ impl World {
         let node = self.node(name);
         node.facts.not_ready = Some("silent".to_owned());
         node.silent_since.get_or_insert(now);
+        node.ready_since = None;
         for task in self.tasks.iter_mut().filter(|t| t.node.as_deref() == Some(name)) {
             if task.phase.holds_node() {
                 task.phase = TaskPhase::Unknown;
@@ -97,8 +103,11 @@ impl World {
     }
 
     pub(super) fn find(&mut self, name: &str) {
+        let now = self.now;
         let node = self.node(name);
-        node.facts.not_ready = None;
+        if node.facts.not_ready.take().is_some() {
+            node.ready_since = Some(now);
+        }
         node.silent_since = None;
         for task in self.tasks.iter_mut().filter(|t| t.node.as_deref() == Some(name)) {
             if task.phase == TaskPhase::Unknown {
@@ -145,9 +154,8 @@ impl World {
             !(t.ending && (over || t.phase == TaskPhase::Stopping))
         });
         let (now, revisions) = (self.now, self.revisions.clone());
-        let bad = |t: &TaskView| {
-            revisions.iter().any(|r| r.name == t.revision && is_bad(&r.template))
-        };
+        let bad =
+            |t: &TaskView| revisions.iter().any(|r| r.name == t.revision && is_bad(&r.template));
         for task in &mut self.tasks {
             match task.phase {
                 TaskPhase::Unknown => {}
@@ -184,7 +192,7 @@ impl World {
             .filter_map(|t| t.node.clone())
             .collect();
         for task in self.tasks.iter_mut().filter(|t| t.phase == TaskPhase::Pending && !t.ending) {
-            let open = |name: &String, node: &NodeView| !node.is_shut() && !used.contains(name);
+            let open = |name: &String, node: &NodeView| !is_shut(node) && !used.contains(name);
             let wanted = |name: &String| task.pin.as_ref().is_none_or(|p| p == name);
             let mut takes: Vec<&String> = self
                 .nodes
@@ -196,6 +204,7 @@ impl World {
             if let Some(node) = takes.first() {
                 task.node = Some((*node).clone());
                 task.phase = TaskPhase::Bound;
+                task.bound = Some(self.now);
                 used.insert((*node).clone());
             }
         }
@@ -219,7 +228,8 @@ impl World {
     pub(super) fn step(&mut self) -> usize {
         let actions = self.decide();
         self.agents();
-        self.now = self.now.checked_add(SignedDuration::try_from(STEP).expect("short")).expect("in range");
+        self.now =
+            self.now.checked_add(SignedDuration::try_from(STEP).expect("short")).expect("in range");
         actions
     }
 
@@ -245,7 +255,11 @@ impl World {
                 return actions;
             }
         }
-        panic!("it does not settle: {:#?}\n{:#?}", &self.actions[self.actions.len() - 12..], self.status);
+        panic!(
+            "it does not settle: {:#?}\n{:#?}",
+            &self.actions[self.actions.len() - 12..],
+            self.status
+        );
     }
 
     fn wanted(&self) -> usize {
@@ -270,7 +284,10 @@ impl World {
                 Action::Delete { task: name, why } => {
                     let task = task(name).expect("it ends what is there");
                     let lock = task.node.as_ref().and_then(|n| self.nodes[n].lock.as_ref());
-                    assert!(lock.is_none() || *why == Ending::Over, "ended on a mission: {action:?}");
+                    assert!(
+                        lock.is_none() || *why == Ending::Over,
+                        "ended on a mission: {action:?}"
+                    );
                     assert!(!task.ending, "ended twice: {action:?}");
                     let served = serving.remove(name.as_str());
                     if let Ending::Outdated { revision } = why {
@@ -356,6 +373,8 @@ impl World {
             },
             score: None,
             created: self.now,
+            bound: None,
+            refusal: None,
             started: None,
             finished: None,
             attempt: 0,
