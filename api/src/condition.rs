@@ -47,6 +47,11 @@ pub const FENCED: &str = "Fenced";
 /// Quotas of tasks are enforced by the kernel on this node (invariant 7).
 pub const QUOTAS_ENFORCED: &str = "QuotasEnforced";
 
+/// Of a TaskSet: enough of its tasks are available.
+pub const AVAILABLE: &str = "Available";
+/// Of a TaskSet: its tasks are, or are becoming, what the template says.
+pub const PROGRESSING: &str = "Progressing";
+
 /// Sets the condition of the same type, or adds it; the transition time moves only when the status
 /// changes. Says whether anything changed.
 pub fn set_condition(conditions: &mut Vec<Condition>, mut new: Condition, now: &Time) -> bool {

@@ -11,6 +11,7 @@ use serde_json::Value;
 
 use crate::duration::Span;
 use crate::name::FunctionName;
+use crate::portion::Portion;
 use crate::quantity::{Bytes, MilliCpu};
 
 /// The class of a violation; the reason word of a `metav1.StatusCause`.
@@ -156,6 +157,17 @@ impl Violations {
     /// The findings, when there are any.
     pub fn into_result<T>(self, value: T) -> Result<T, Violations> {
         if self.is_empty() { Ok(value) } else { Err(self) }
+    }
+
+    /// The same findings in an object that lies deeper: paths that begin with `from` begin with `to`.
+    #[must_use]
+    pub fn below(mut self, from: &str, to: &str) -> Self {
+        for violation in &mut self.0 {
+            if let Some(rest) = violation.path.strip_prefix(from) {
+                violation.path = format!("{to}{rest}");
+            }
+        }
+        self
     }
 
     /// Keeps the findings for which `keep` holds.
@@ -405,6 +417,13 @@ fn format_check(format: &str) -> Option<FormatCheck> {
         },
         "byte-quantity" => |value| {
             scalar_text(value)?.parse::<Bytes>().map(drop).map_err(|e| FormatProblem {
+                reason: e.to_string(),
+                suggestion: Some(e.suggestion().to_owned()),
+            })
+        },
+        "portion" => |value| {
+            let portion = scalar_text(value)?.parse::<Portion>();
+            portion.map(drop).map_err(|e| FormatProblem {
                 reason: e.to_string(),
                 suggestion: Some(e.suggestion().to_owned()),
             })

@@ -9,8 +9,8 @@ use muster_api::selector::{FieldSelector, LabelSelector, SelectorError};
 
 use crate::client::Selection;
 use crate::command::{
-    apply, cordon, delete, describe, drain, get, local, logs, node, offers, plan, token, top,
-    version, wait, why,
+    apply, cordon, delete, describe, drain, get, local, logs, node, offers, plan, rollout, scale,
+    token, top, version, wait, why,
 };
 use crate::output::ui::Color;
 
@@ -69,6 +69,11 @@ pub(crate) enum Command {
     Offers(offers::Args),
     /// Delete objects; a framework is torn down with its tasks
     Delete(delete::Args),
+    /// Change how many tasks sets have
+    Scale(scale::Args),
+    /// Follow, stop, go on with or take back the change of a set's template
+    #[command(subcommand)]
+    Rollout(rollout::Command),
     /// Print what a task wrote
     Logs(logs::Args),
     /// Show what nodes or tasks use, measured by the kernel
@@ -192,6 +197,17 @@ mod tests {
             "muster drain a --grace-period 5 --timeout 2m",
             "muster node register r1 --kind robot --speed 0.5 --label area=lab",
             "muster node fence r1 --reason off --by ada --yes",
+            "muster scale taskset/x --replicas=3",
+            "muster scale ts/x ts/y --replicas 0 --current-replicas 2",
+            "muster rollout status ts/x --timeout 10s --watch=false",
+            "muster rollout undo taskset/x --to-revision=2",
+            "muster rollout history ts/x --revision 3",
+            "muster rollout pause ts/x ts/y",
+            "muster rollout resume x",
+            "muster rollout restart x",
+            "muster delete taskset x --cascade=orphan",
+            "muster node lock r1 --holder ada --reason tray",
+            "muster node unlock r1 --holder ada",
             "muster token create --ttl 2h --node r1 --uses 3",
             "muster token list",
             "muster token delete abc",

@@ -50,6 +50,17 @@ pub(crate) enum Mode {
     DryRun,
 }
 
+/// How an object is deleted.
+#[derive(Debug, Clone, Copy, Default)]
+pub(crate) struct Deletion<'a> {
+    /// Seconds between asking a task to end and killing it; none: its own.
+    pub(crate) grace: Option<u32>,
+    /// Only this one, not a later one of the same name.
+    pub(crate) uid: Option<&'a str>,
+    /// What becomes of what it owns: Background, Foreground, Orphan.
+    pub(crate) propagation: Option<&'a str>,
+}
+
 impl Selection {
     /// One object by name.
     pub(crate) fn name(name: &str) -> Self {
@@ -203,21 +214,29 @@ impl Client {
         self.call(Method::PATCH, &uri, Some(("application/merge-patch+json", patch))).await
     }
 
-    /// Deletes an object. With `uid`: only that one, not a later one of the same name.
+    /// Applies a JSON merge patch to any path.
+    pub(crate) async fn patch_path(&self, uri: &str, patch: &Value) -> Result<Value, CliError> {
+        let uri = with_query(uri, &write_pairs(Mode::Store));
+        self.call(Method::PATCH, &uri, Some(("application/merge-patch+json", patch))).await
+    }
+
+    /// Deletes an object.
     pub(crate) async fn delete(
         &self,
         info: &KindInfo,
         namespace: Option<&str>,
         name: &str,
-        grace: Option<u32>,
-        uid: Option<&str>,
+        how: Deletion<'_>,
     ) -> Result<Value, CliError> {
         let mut options = json!({"apiVersion": "v1", "kind": "DeleteOptions"});
-        if let Some(grace) = grace {
+        if let Some(grace) = how.grace {
             options["gracePeriodSeconds"] = grace.into();
         }
-        if let Some(uid) = uid {
+        if let Some(uid) = how.uid {
             options["preconditions"] = json!({"uid": uid});
+        }
+        if let Some(policy) = how.propagation {
+            options["propagationPolicy"] = policy.into();
         }
         let uri = path(info, namespace, Some(name));
         self.call(Method::DELETE, &uri, Some(("application/json", &options))).await

@@ -44,6 +44,9 @@ pub(crate) enum CliError {
     /// Tasks have ended, so that what is waited for can never come.
     #[error("{what}")]
     Ended { what: String, hint: Option<String> },
+    /// What was asked for has not come about and will not.
+    #[error("{what}")]
+    Failed { what: String, hint: Option<String> },
     /// A file that cannot be read.
     #[error("cannot read {}", path.display())]
     Read { path: PathBuf, source: io::Error },
@@ -171,7 +174,8 @@ impl CliError {
             CliError::Read { source, .. } if source.kind() == io::ErrorKind::NotFound => {
                 Class::NotFound
             }
-            CliError::Answer { .. }
+            CliError::Failed { .. }
+            | CliError::Answer { .. }
             | CliError::Read { .. }
             | CliError::Output(_)
             | CliError::BrokenPipe
@@ -189,7 +193,8 @@ impl CliError {
         match self {
             CliError::Usage { hint, .. }
             | CliError::Timeout { hint, .. }
-            | CliError::Ended { hint, .. } => hint.clone(),
+            | CliError::Ended { hint, .. }
+            | CliError::Failed { hint, .. } => hint.clone(),
             CliError::Config(error) => Some(error.hint()),
             CliError::Refused(refusal) => refusal.hint.clone(),
             CliError::Unreachable { origin, source, .. } => {

@@ -65,6 +65,16 @@ pub(crate) fn framework(name: &str, status: Value) -> Value {
     })
 }
 
+/// A set of three tasks, with this status.
+pub(crate) fn taskset(name: &str, status: Value) -> Value {
+    json!({
+        "apiVersion": muster_api::API_VERSION, "kind": "TaskSet",
+        "metadata": {"name": name, "namespace": "default", "generation": 2},
+        "spec": {"replicas": 3, "template": {"spec": {"run": {"process": {"command": ["x"]}}}}},
+        "status": status,
+    })
+}
+
 /// A robot with this status.
 pub(crate) fn node(name: &str, status: Value) -> Value {
     json!({

@@ -19,7 +19,7 @@ impl PartialEq for Named<'_> {
 }
 
 /// What `all` means: what people put there or look after. Events would drown the rest.
-const ALL: [&str; 3] = ["Node", "Task", "Lease"];
+const ALL: [&str; 4] = ["Node", "Task", "TaskSet", "Lease"];
 
 /// The kind that a word means.
 pub(crate) fn kind(word: &str) -> Result<&'static KindInfo, CliError> {
@@ -116,7 +116,7 @@ mod tests {
             (vec!["task/x", "no/r1"], vec!["Task/x", "Node/r1"]),
             (vec!["nodes,le"], vec!["Node/*", "Lease/*"]),
             (vec!["tasks.muster.dev"], vec!["Task/*"]),
-            (vec!["all"], vec!["Node/*", "Task/*", "Lease/*"]),
+            (vec!["all"], vec!["Node/*", "Task/*", "TaskSet/*", "Lease/*"]),
             (vec!["lease", "r1.body"], vec!["Lease/r1.body"]),
         ] {
             assert_eq!(

@@ -7,6 +7,7 @@ use k8s_openapi::api::core::v1::{Event, EventSource, ObjectReference};
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::{ObjectMeta, Time};
 use muster_api::kind::namespace::DEFAULT;
 use muster_api::kind::task::Task;
+use muster_api::kind::taskset::TaskSet;
 use tokio::sync::mpsc;
 
 use crate::context::Context;
@@ -56,6 +57,16 @@ impl Recorder {
         self.put(Happening { about: task_reference(task), kind: "Warning", reason, message });
     }
 
+    /// Something usual about a set of tasks.
+    pub fn set(&self, set: &TaskSet, reason: &'static str, message: String) {
+        self.put(Happening { about: set_reference(set), kind: "Normal", reason, message });
+    }
+
+    /// Something about a set of tasks that its owner should look at.
+    pub fn warn_set(&self, set: &TaskSet, reason: &'static str, message: String) {
+        self.put(Happening { about: set_reference(set), kind: "Warning", reason, message });
+    }
+
     /// Something usual about a node.
     pub fn node(&self, node: &str, reason: &'static str, message: String) {
         self.put(Happening { about: node_reference(node), kind: "Normal", reason, message });
@@ -74,6 +85,17 @@ fn task_reference(task: &Task) -> ObjectReference {
         name: task.metadata.name.clone(),
         namespace: task.metadata.namespace.clone(),
         uid: task.metadata.uid.clone(),
+        ..ObjectReference::default()
+    }
+}
+
+fn set_reference(set: &TaskSet) -> ObjectReference {
+    ObjectReference {
+        api_version: Some(muster_api::API_VERSION.to_owned()),
+        kind: Some("TaskSet".to_owned()),
+        name: set.metadata.name.clone(),
+        namespace: set.metadata.namespace.clone(),
+        uid: set.metadata.uid.clone(),
         ..ObjectReference::default()
     }
 }

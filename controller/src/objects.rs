@@ -18,6 +18,10 @@ use crate::store::{Key, Op, Precondition, Resource, Store, StoreError, Stored};
 pub const NODES: Resource = Resource::new("nodes");
 /// Tasks.
 pub const TASKS: Resource = Resource::new("tasks");
+/// TaskSets.
+pub const TASK_SETS: Resource = Resource::new("tasksets");
+/// Templates that TaskSets have or had.
+pub const REVISIONS: Resource = Resource::new("tasksetrevisions");
 /// Frameworks.
 pub const FRAMEWORKS: Resource = Resource::new("frameworks");
 /// Quotas.

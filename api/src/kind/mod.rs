@@ -8,6 +8,8 @@ pub mod namespace;
 pub mod node;
 pub mod quota;
 pub mod task;
+pub mod taskset;
+pub mod taskset_revision;
 
 use std::any::TypeId;
 use std::collections::BTreeMap;
@@ -65,6 +67,8 @@ impl KindInfo {
 pub static ALL: &[KindInfo] = &[
     node::INFO,
     task::INFO,
+    taskset::INFO,
+    taskset_revision::INFO,
     lease::INFO,
     framework::INFO,
     quota::INFO,

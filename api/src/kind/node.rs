@@ -51,6 +51,29 @@ pub struct NodeSpec {
     pub speed: Option<f64>,
 }
 
+/// Annotation of a Node that is in the middle of a mission, `HOLDER: REASON`: no TaskSet ends a task there.
+pub const MISSION_LOCK: &str = "muster.dev/mission-lock";
+
+/// Why nothing is to be changed on a node now.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct MissionLock {
+    /// The person or task that set it.
+    pub holder: String,
+    /// What they say about it; may be empty.
+    pub reason: String,
+}
+
+impl Node {
+    /// The mission that the node is on. The one place where a lock is read: one that an agent sets by itself, without
+    /// the controller, would be seen here too.
+    #[must_use]
+    pub fn mission_lock(&self) -> Option<MissionLock> {
+        let text = self.metadata.annotations.as_ref()?.get(MISSION_LOCK)?;
+        let (holder, reason) = text.split_once(':').unwrap_or((text, ""));
+        Some(MissionLock { holder: holder.trim().to_owned(), reason: reason.trim().to_owned() })
+    }
+}
+
 /// A mark on a node.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "camelCase", deny_unknown_fields)]

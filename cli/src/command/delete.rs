@@ -11,6 +11,7 @@ use serde_json::Value;
 use super::gone::{Doomed, until_gone};
 use super::{FirstError, Outcome};
 use crate::args::{Select, span};
+use crate::client::Deletion;
 use crate::error::CliError;
 use crate::manifests;
 use crate::output::human;
@@ -44,9 +45,35 @@ pub(crate) struct Args {
     /// Wait this long at most [default: for ever]
     #[arg(long, value_name = "TIME", value_parser = span)]
     timeout: Option<Span>,
+    /// What becomes of what the objects own, the tasks of a set for example
+    #[arg(long, value_enum, default_value_t, value_name = "HOW")]
+    cascade: Cascade,
     /// That an object does not exist is no error
     #[arg(long)]
     ignore_not_found: bool,
+}
+
+/// `--cascade`, in kubectl's words.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, clap::ValueEnum)]
+enum Cascade {
+    /// It goes as well, in its own time
+    #[default]
+    Background,
+    /// It goes first
+    Foreground,
+    /// It stays
+    Orphan,
+}
+
+impl Cascade {
+    fn policy(self) -> Option<&'static str> {
+        match self {
+            // What happens when nothing is said.
+            Cascade::Background => None,
+            Cascade::Foreground => Some("Foreground"),
+            Cascade::Orphan => Some("Orphan"),
+        }
+    }
 }
 
 /// One object to delete.
@@ -66,7 +93,7 @@ pub(crate) async fn run(args: Args, session: &mut Session) -> Outcome {
     let mut errors = FirstError::default();
     let mut doomed = Vec::new();
     for victim in &victims {
-        match end(victim, grace, session).await {
+        match end(victim, grace, args.cascade, session).await {
             Ok(one) => {
                 session.ui.line(&sentence(victim, &one))?;
                 doomed.push(one);
@@ -136,12 +163,18 @@ fn sentence(victim: &Victim, doomed: &Doomed) -> String {
     }
 }
 
-async fn end(victim: &Victim, grace: Option<u32>, session: &Session) -> Result<Doomed, CliError> {
+async fn end(
+    victim: &Victim,
+    grace: Option<u32>,
+    cascade: Cascade,
+    session: &Session,
+) -> Result<Doomed, CliError> {
     let Victim { info, namespace, name } = victim;
     let namespace = namespace.as_deref();
     let object = session.client.get(info, namespace, name).await?;
     let doomed = Doomed::new(info, object);
-    session.client.delete(info, namespace, name, grace, Some(&doomed.uid)).await?;
+    let how = Deletion { grace, uid: Some(&doomed.uid), propagation: cascade.policy() };
+    session.client.delete(info, namespace, name, how).await?;
     Ok(doomed)
 }
 

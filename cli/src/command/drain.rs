@@ -10,7 +10,7 @@ use serde_json::Value;
 use super::gone::{Doomed, until_gone};
 use super::{Outcome, cordon};
 use crate::args::span;
-use crate::client::Selection;
+use crate::client::{Deletion, Selection};
 use crate::error::CliError;
 use crate::exit;
 use crate::output::human;
@@ -52,13 +52,9 @@ pub(crate) async fn run(args: Args, session: &mut Session) -> Outcome {
     for doomed in &tasks {
         let name = name(&doomed.object);
         let namespace = doomed.namespace.as_deref();
-        let deleted = session.client.delete(
-            doomed.info,
-            namespace,
-            &name,
-            args.grace_period,
-            Some(&doomed.uid),
-        );
+        let how =
+            Deletion { grace: args.grace_period, uid: Some(&doomed.uid), ..Deletion::default() };
+        let deleted = session.client.delete(doomed.info, namespace, &name, how);
         match deleted.await {
             Ok(_) => {}
             // It ended by itself meanwhile.

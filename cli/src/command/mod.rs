@@ -10,10 +10,13 @@ pub(crate) mod fence;
 pub(crate) mod get;
 pub(crate) mod gone;
 pub(crate) mod local;
+pub(crate) mod lock;
 pub(crate) mod logs;
 pub(crate) mod node;
 pub(crate) mod offers;
 pub(crate) mod plan;
+pub(crate) mod rollout;
+pub(crate) mod scale;
 pub(crate) mod settle;
 pub(crate) mod token;
 pub(crate) mod top;
@@ -75,6 +78,8 @@ pub(crate) async fn dispatch(command: Command, session: &mut Session) -> Outcome
         Command::Why(args) => why::run(args, session).await,
         Command::Offers(args) => offers::run(args, session).await,
         Command::Delete(args) => delete::run(args, session).await,
+        Command::Scale(args) => scale::run(args, session).await,
+        Command::Rollout(command) => rollout::run(command, session).await,
         Command::Logs(args) => logs::run(args, session).await,
         Command::Top(args) => top::run(args, session).await,
         Command::Wait(args) => wait::run(args, session).await,

@@ -4,7 +4,7 @@ use muster_api::kind;
 use serde_json::{Map, Value, json};
 
 use super::token::{Terms, join_command, make, secret};
-use super::{Outcome, fence};
+use super::{Outcome, fence, lock};
 use crate::args::pair;
 use crate::client::Mode;
 use crate::error::{Class, CliError};
@@ -19,6 +19,10 @@ pub(crate) enum Command {
     Register(RegisterArgs),
     /// Confirm that a node is off: its tasks end, and what they held is free
     Fence(fence::Args),
+    /// Keep the tasks on nodes from being changed while a mission lasts
+    Lock(lock::LockArgs),
+    /// Say that the mission is over
+    Unlock(lock::UnlockArgs),
 }
 
 /// `muster node register`.
@@ -58,6 +62,8 @@ pub(crate) async fn run(command: Command, session: &mut Session) -> Outcome {
     match command {
         Command::Register(args) => register(args, session).await,
         Command::Fence(args) => fence::run(args, session).await,
+        Command::Lock(args) => lock::lock(args, session).await,
+        Command::Unlock(args) => lock::unlock(args, session).await,
     }
 }
 

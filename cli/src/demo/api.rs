@@ -10,7 +10,7 @@ use serde::Deserialize;
 use serde::de::DeserializeOwned;
 use serde_json::{Value, json};
 
-use crate::client::{Client, Mode, Selection, group_path, path, with_query};
+use crate::client::{Client, Deletion, Mode, Selection, group_path, path, with_query};
 use crate::config;
 use crate::error::CliError;
 use crate::target;
@@ -133,7 +133,8 @@ impl Api {
 
     /// Asks for the end of a task; it is gone when none of its processes is left.
     pub(super) async fn delete(&self, name: &str) -> Result<(), CliError> {
-        match self.client.delete(target::kind("task")?, NAMESPACE, name, None, None).await {
+        match self.client.delete(target::kind("task")?, NAMESPACE, name, Deletion::default()).await
+        {
             Err(error) if !error.is_not_found() => Err(error),
             _ => Ok(()),
         }

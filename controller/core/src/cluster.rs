@@ -47,6 +47,12 @@ pub struct NodeFacts {
 }
 
 impl NodeFacts {
+    /// The facts of one node, by itself.
+    #[must_use]
+    pub fn of(node: &Node) -> Self {
+        Models::default().facts(node)
+    }
+
     /// The conflict groups that a task with these actuators takes: all of the robot's when it takes
     /// any (Avalon, III-B), none when it takes none.
     #[must_use]

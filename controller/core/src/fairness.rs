@@ -227,7 +227,8 @@ mod tests {
         let reserve = |cluster: &mut Cluster, title: &str, groups: &[&str]| {
             let compute = Compute::new(MilliCpu(500), Bytes(64));
             let groups = groups.iter().map(|group| (*group).to_owned()).collect();
-            let reservation = Reservation { title: title.into(), compute, groups };
+            let reservation =
+                Reservation { title: title.into(), compute, groups, ..Reservation::default() };
             cluster.reserve(&TaskUid::new(title), 0, reservation).expect("there is room");
         };
         reserve(&mut cluster, "lab/driver", &[DEFAULT_GROUP]);

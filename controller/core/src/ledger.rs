@@ -16,7 +16,7 @@ use muster_api::quantity::{Bytes, MilliCpu};
 use muster_api::resource::{Compute, Shortage};
 
 /// What one task holds of a node.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Reservation {
     /// `namespace/name`, for messages.
     pub title: Arc<str>,
@@ -26,6 +26,8 @@ pub struct Reservation {
     pub groups: Vec<String>,
     /// How it stands against tasks that find no room.
     pub standing: Standing,
+    /// Tasks of the namespace with the same word are not on the same node.
+    pub apart: Option<Arc<str>>,
 }
 
 /// What preemption asks of who holds something.
@@ -319,7 +321,7 @@ mod tests {
             title: "default/t".into(),
             compute: Compute::new(MilliCpu(cpu), Bytes(0)),
             groups: groups.iter().map(|g| (*g).to_owned()).collect(),
-            standing: Standing::default(),
+            ..Reservation::default()
         }
     }
 

@@ -20,6 +20,7 @@
 //! | [`fairness`] | namespaces' shares and quotas |
 //! | [`recent`] | one allocation for what many nodes or tasks have in common |
 //! | [`node_health`] | when a node counts as lost |
+//! | [`taskset`] | which tasks of a TaskSet begin, end and follow each other |
 //! | [`stray`] | what an agent runs and should not |
 //! | [`report`] | typed reasons, with the words people read |
 #![deny(missing_docs)]
@@ -38,3 +39,4 @@ pub mod report;
 pub mod schedule;
 pub mod space;
 pub mod stray;
+pub mod taskset;

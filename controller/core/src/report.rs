@@ -42,6 +42,11 @@ pub enum Refusal {
         /// Name of the executor's task.
         task: String,
     },
+    /// A task that this one is to be apart from is there.
+    Apart {
+        /// `namespace/name` of that task.
+        task: String,
+    },
     /// The robot has no such sensor functions.
     NoSensor {
         /// Those it has not.
@@ -118,6 +123,7 @@ impl Refusal {
             Refusal::SelectorMismatch { .. } => "SelectorMismatch",
             Refusal::NoRuntime { .. } => "NoRuntime",
             Refusal::NoExecutor { .. } => "NoExecutor",
+            Refusal::Apart { .. } => "Apart",
             Refusal::NoSensor { .. } => "NoSensor",
             Refusal::NoActuator { .. } => "NoActuator",
             Refusal::TooSmall { .. } => "TooSmall",
@@ -182,6 +188,9 @@ impl fmt::Display for Refusal {
             }
             Refusal::NoExecutor { task } => {
                 write!(f, "does not run the executor {task}")
+            }
+            Refusal::Apart { task } => {
+                write!(f, "has {task}, from which placement.apart keeps the task away")
             }
             Refusal::NoSensor { missing } => write!(f, "has no sensor {}", list(missing)),
             Refusal::NoActuator { missing } if missing.is_empty() => {

@@ -12,6 +12,7 @@
 //! | [`books`] | the scheduler's ledger | writes used, free and leases into Node status |
 //! | [`quotas`] | the scheduler's ledger | writes what namespaces have into Quota status |
 //! | [`health`] | heartbeats | marks silent nodes and their tasks |
+//! | [`taskset`] | TaskSets, their tasks, nodes | begins and ends tasks, changes them, goes back |
 //! | [`deletion`] | Tasks being deleted | removes those whose processes are gone |
 //! | [`garbage`] | ownerReferences | deletes what lost its owner |
 //! | [`history`] | Events, the store's history | forgets what is old |
@@ -30,6 +31,7 @@ mod moves;
 mod preempt;
 pub mod quotas;
 pub mod schedule;
+pub mod taskset;
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -82,6 +84,7 @@ pub fn spawn(
     run("deadline", Box::pin(deadline::run(Arc::clone(context))));
     run("deletion", Box::pin(deletion::run(Arc::clone(context))));
     run("garbage", Box::pin(garbage::run(Arc::clone(context))));
+    run("taskset", Box::pin(taskset::run(Arc::clone(context))));
     run("history", Box::pin(history::run(Arc::clone(context))));
     run("board", Box::pin(crate::session::board::run(Arc::clone(context), Arc::clone(sessions))));
     run("poses", Box::pin(poses::run(Arc::clone(context), Arc::clone(poses))));

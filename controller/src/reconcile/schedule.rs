@@ -371,11 +371,18 @@ impl Scheduler {
                     || status.stop.is_some()
                     || task.metadata.deletion_timestamp.is_some();
                 let standing = schedule::standing(&title, &task.spec, stopping);
+                let apart = task.spec.placement.apart.map(Into::into);
                 // Which groups it holds is said by the Lease objects.
                 self.cluster.book(
                     &uid,
                     &node,
-                    Reservation { title: title.into(), compute, groups: Vec::new(), standing },
+                    Reservation {
+                        title: title.into(),
+                        compute,
+                        groups: Vec::new(),
+                        standing,
+                        apart,
+                    },
                 );
                 self.dirty.insert(node);
             }

@@ -21,7 +21,7 @@ use super::selector::Selection;
 use super::{Answer, Call, body, failure::Failure, metadata};
 use crate::context::Context;
 use crate::objects;
-use crate::store::{Key, Precondition, Resource, Store, StoreError, Stored};
+use crate::store::{Key, Op, Precondition, Resource, Store, StoreError, Stored};
 
 /// What a task gets that says nothing about it, s.
 const DEFAULT_GRACE: i64 = 10;
@@ -80,6 +80,15 @@ pub(crate) async fn delete_with_grace(
     match end(context, entry, key, &options).await? {
         Ended::Gone(stored) | Ended::Waiting(stored) => Ok(stored),
     }
+}
+
+/// The deletion of an object as a part of a transaction: at once where nobody has to confirm anything, else the wish.
+pub(crate) fn operation(now: Timestamp, present: &Stored) -> Op {
+    let (object, key) = (present.value(), present.key.clone());
+    if !metadata::has_finalizers(&object) && !is_held(key.resource, &object) {
+        return Op::remove(key, present.revision);
+    }
+    Op::replace(key, wish(now, &object, &Options::default(), None), present.revision)
 }
 
 pub(super) async fn delete(call: Call, target: Object) -> Answer {

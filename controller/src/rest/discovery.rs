@@ -78,6 +78,17 @@ fn resource(entry: &Entry) -> Vec<Value> {
     if info.kind == "Node" {
         sub("fence", "NodeFence", vec!["create"]);
     }
+    if info.kind == "TaskSet" {
+        all.push(json!({
+            "name": format!("{}/scale", info.plural),
+            "singularName": "",
+            "namespaced": true,
+            "group": "autoscaling",
+            "version": "v1",
+            "kind": "Scale",
+            "verbs": ["get", "patch", "update"],
+        }));
+    }
     all
 }
 

@@ -13,6 +13,7 @@
 //! | `selector` | label and field selectors |
 //! | [`namespace`] | the default namespace; ending of namespaces |
 //! | [`token`], `join`, `enrol` | join tokens; certificates for agents; which agent speaks for a node |
+//! | `scale` | how many tasks a set has, as `autoscaling/v1` Scale |
 //! | `fence` | a person's word that a node is off |
 //! | `offers` | what frameworks are offered, and why they are not |
 //! | `poses` | where robots are now |
@@ -40,6 +41,7 @@ mod poses;
 mod query;
 mod question;
 pub(crate) mod registry;
+mod scale;
 mod selector;
 pub mod token;
 mod update;
@@ -160,6 +162,9 @@ async fn objects(call: Call, verb: Verb, object: Object) -> Answer {
     }
     if object.subresource == Some(Subresource::Fence) {
         return fence::fence(call, object).await;
+    }
+    if object.subresource == Some(Subresource::Scale) {
+        return scale::answer(call, verb, object).await;
     }
     match verb {
         Verb::Get => list::get(&call, &object),

@@ -1,6 +1,8 @@
 //! PATCH: JSON merge patch (RFC 7396) and JSON patch (RFC 6902).
 
+use axum::body::Body;
 use bytes::Bytes;
+use http::Request;
 use json_patch::Patch;
 use serde_json::Value;
 
@@ -13,7 +15,8 @@ const JSON: &str = "application/json-patch+json";
 /// As many operations as Kubernetes takes.
 const OPERATIONS: usize = 10_000;
 
-enum Change {
+/// A patch that was read.
+pub(super) enum Change {
     Merge(Value),
     Json(Patch),
 }
@@ -21,13 +24,18 @@ enum Change {
 pub(super) async fn patch(call: Call, target: Object) -> Answer {
     let options = Options::read(&call)?;
     let Call { context, request, .. } = call;
+    let patch = of_request(request).await?;
+    change(&context, &target, &options, |present| apply(&patch, present)).await
+}
+
+/// The patch that a request brings.
+pub(super) async fn of_request(request: Request<Body>) -> Result<Change, Failure> {
     let (parts, body) = request.into_parts();
     let media = body::media_type(&parts.headers);
     if media != MERGE && media != JSON {
         return Err(body::unsupported(&media, &format!("{JSON}, {MERGE}")));
     }
-    let patch = read(&media, &body::bytes(body).await?)?;
-    change(&context, &target, &options, |present| apply(&patch, present)).await
+    read(&media, &body::bytes(body).await?)
 }
 
 fn read(media: &str, bytes: &Bytes) -> Result<Change, Failure> {
@@ -50,7 +58,8 @@ fn read(media: &str, bytes: &Bytes) -> Result<Change, Failure> {
     Ok(Change::Json(patch))
 }
 
-fn apply(patch: &Change, present: &Value) -> Result<Value, Failure> {
+/// What an object becomes by a patch.
+pub(super) fn apply(patch: &Change, present: &Value) -> Result<Value, Failure> {
     let mut object = present.clone();
     // The patch says which version it is for, or none; what is there now is not the client's word.
     if let Some(metadata) = object["metadata"].as_object_mut() {

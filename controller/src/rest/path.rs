@@ -81,6 +81,8 @@ pub enum Subresource {
     Fence,
     /// `…/pose`
     Pose,
+    /// `…/scale`
+    Scale,
 }
 
 /// One object, or a collection when `name` is `None`.
@@ -104,6 +106,7 @@ impl Object {
         match self.subresource {
             Some(Subresource::Log | Subresource::Why | Subresource::Pose) => verb == Verb::Get,
             Some(Subresource::Fence) => verb == Verb::Create,
+            Some(Subresource::Scale) => matches!(verb, Verb::Get | Verb::Update | Verb::Patch),
             Some(Subresource::Status) => {
                 self.entry.info.has_status
                     && (verb == Verb::Get
@@ -247,6 +250,7 @@ fn object(group: &str, parts: &[&str]) -> Option<Object> {
         Some("why") if entry.has_why => Some(Subresource::Why),
         Some("fence") if entry.info.kind == "Node" => Some(Subresource::Fence),
         Some("pose") if entry.info.kind == "Node" => Some(Subresource::Pose),
+        Some("scale") if entry.info.kind == "TaskSet" => Some(Subresource::Scale),
         Some(_) => return None,
     };
     // An object of a namespaced kind has no path outside its namespace.
@@ -308,6 +312,12 @@ mod tests {
             ("GET", format!("{g}/poses"), "list Poses"),
             ("GET", format!("{g}/poses?watch=true"), "watch Poses"),
             ("POST", format!("{g}/poses"), "405"),
+            ("GET", format!("{g}/namespaces/a/tasks/t/scale"), "404"),
+            (
+                "PATCH",
+                format!("{g}/namespaces/a/tasksets/t/scale"),
+                "patch tasksets ns=Some(\"a\") name=Some(\"t\") sub=Some(Scale)",
+            ),
             ("DELETE", format!("{g}/nodes"), "deletecollection nodes ns=None name=None sub=None"),
             ("GET", "/api/v1/namespaces".into(), "list namespaces ns=None name=None sub=None"),
             (

@@ -78,6 +78,8 @@ fn entry(info: &'static KindInfo) -> Entry {
             "Lease" => READ,
             // Made when a framework subscribes.
             "Framework" => READ_AND_REMOVE,
+            // Made by the controller; one that lost its set may be removed by hand.
+            "TaskSetRevision" => READ_AND_REMOVE,
             _ => ALL,
         },
         categories: if info.group.is_empty() { &[] } else { &["muster"] },

@@ -7,6 +7,7 @@ use muster_api::kind;
 use muster_api::kind::namespace::Namespace;
 use muster_api::kind::node::Node;
 use muster_api::kind::task::Task;
+use muster_api::kind::taskset::TaskSet;
 use muster_api::validate::Violations;
 use serde::Deserialize as _;
 use serde_json::Value;
@@ -147,6 +148,7 @@ fn next(
 fn check_status(entry: &Entry, name: &str, object: &Value) -> Result<(), Failure> {
     let read = match entry.info.kind {
         "Task" => Task::deserialize(object).map(drop),
+        "TaskSet" => TaskSet::deserialize(object).map(drop),
         "Node" => Node::deserialize(object).map(drop),
         "Namespace" => Namespace::deserialize(object).map(drop),
         _ => Ok(()),

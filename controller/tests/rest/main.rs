@@ -4,6 +4,7 @@
 mod access;
 mod agent;
 mod fencing;
+mod fleet;
 mod objects;
 mod poses;
 mod removal;

@@ -11,3 +11,4 @@ mod poses;
 mod preemption;
 mod quotas;
 mod survival;
+mod tasksets;

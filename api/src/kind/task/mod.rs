@@ -1,6 +1,6 @@
 //! Task: one run of one program on one node, the unit that is placed.
 
-mod rules;
+pub(super) mod rules;
 #[cfg(test)]
 mod tests;
 
@@ -115,6 +115,12 @@ pub struct Placement {
     /// The one node it may run on.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub node: Option<String>,
+    /// The node that is tried first, before any better one.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub prefer: Option<String>,
+    /// Tasks of the namespace that say the same word here are on different nodes.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub apart: Option<String>,
     /// Taints it puts up with.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub tolerations: Vec<Toleration>,
@@ -456,6 +462,9 @@ pub struct TaskStatus {
     /// The lease that came with the placement.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub lease: Option<TaskLease>,
+    /// Whether its readiness probe says that it can serve; none: it has no probe.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub ready: Option<bool>,
     /// Number of the current attempt; 1 is the first, 0: none yet.
     pub attempt: u32,
     /// How the last attempt that ended ended.

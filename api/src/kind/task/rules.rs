@@ -11,7 +11,7 @@ use crate::quantity::{Bytes, MilliCpu};
 use crate::validate::{Violations, element_path, member_path};
 
 /// The rules beside those that the types hold.
-pub(super) fn rules(spec: &TaskSpec, violations: &mut Violations) {
+pub(in crate::kind) fn rules(spec: &TaskSpec, violations: &mut Violations) {
     placement_rules(spec, violations);
     resource_rules(&spec.resources, violations);
     run_rules(&spec.run, violations);
@@ -77,10 +77,12 @@ fn placement_rules(spec: &TaskSpec, violations: &mut Violations) {
             )
             .suggest("set on: Robot");
     }
-    if let Some(node) = &placement.node
-        && let Err(error) = check_name(node)
+    for (field, name) in
+        [("node", &placement.node), ("prefer", &placement.prefer), ("apart", &placement.apart)]
     {
-        violations.invalid("spec.placement.node", error.to_string());
+        if let Some(Err(error)) = name.as_deref().map(check_name) {
+            violations.invalid(format!("spec.placement.{field}"), error.to_string());
+        }
     }
     placement.selector.validate("spec.placement.selector", violations);
     for (i, toleration) in placement.tolerations.iter().enumerate() {

@@ -7,6 +7,7 @@ mod lease;
 mod node;
 mod quota;
 mod task;
+mod taskset;
 
 use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::ObjectMeta;
@@ -98,6 +99,14 @@ async fn describe(
         "Quota" => {
             let quota: Quota = serde_json::from_value(object).map_err(read)?;
             quota::describe(&mut sheet, &quota, now);
+        }
+        "TaskSet" => {
+            let set = serde_json::from_value(object).map_err(read)?;
+            let (namespace, its) = taskset::its_tasks(&set);
+            let list = session.client.list(target::kind("task")?, namespace, &its).await?;
+            let tasks: Vec<Task> =
+                list.items.into_iter().filter_map(|o| serde_json::from_value(o).ok()).collect();
+            taskset::describe(&mut sheet, &set, &tasks, now);
         }
         "Task" => task::describe(&mut sheet, &serde_json::from_value(object).map_err(read)?, now),
         "Lease" => lease::describe(&mut sheet, &serde_json::from_value(object).map_err(read)?, now),

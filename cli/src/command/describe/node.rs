@@ -27,6 +27,10 @@ pub(super) fn describe(sheet: &mut Sheet, node: &Node, tasks: &[Task], now: Time
     if node.spec.unschedulable {
         sheet.field("Cordoned", Cell::new("yes; nothing new is placed here", Mood::Warn));
     }
+    if let Some(lock) = node.mission_lock() {
+        let text = format!("by {}: {}; its tasks stay as they are", lock.holder, lock.reason);
+        sheet.field("Mission lock", Cell::new(text, Mood::Warn));
+    }
     let taints = node.spec.taints.iter();
     sheet.list("Taints", taints.map(|t| format!("{}={}:{:?}", t.key, t.value, t.effect)));
     sheet.maybe("Speed", node.spec.speed.map(|s| format!("{s} m/s")));

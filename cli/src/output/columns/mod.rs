@@ -7,6 +7,8 @@ mod namespace;
 mod node;
 mod quota;
 pub(crate) mod task;
+pub(crate) mod taskset;
+mod taskset_revision;
 
 use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
@@ -18,6 +20,8 @@ use muster_api::kind::namespace::Namespace;
 use muster_api::kind::node::Node;
 use muster_api::kind::quota::Quota;
 use muster_api::kind::task::Task;
+use muster_api::kind::taskset::TaskSet;
+use muster_api::kind::taskset_revision::TaskSetRevision;
 use serde::de::DeserializeOwned;
 use serde_json::Value;
 
@@ -61,6 +65,10 @@ pub(crate) fn table(info: &KindInfo, objects: &[Value], layout: Layout) -> Table
     match info.kind {
         "Node" => typed::<Node>(node::COLUMNS, info, objects, layout),
         "Task" => typed::<Task>(task::COLUMNS, info, objects, layout),
+        "TaskSet" => typed::<TaskSet>(taskset::COLUMNS, info, objects, layout),
+        "TaskSetRevision" => {
+            typed::<TaskSetRevision>(taskset_revision::COLUMNS, info, objects, layout)
+        }
         "Lease" => typed::<Lease>(lease::COLUMNS, info, objects, layout),
         "Framework" => typed::<Framework>(framework::COLUMNS, info, objects, layout),
         "Quota" => typed::<Quota>(quota::COLUMNS, info, objects, layout),

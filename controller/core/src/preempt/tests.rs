@@ -154,12 +154,12 @@ fn crowded(holders: &[Holder], driven: bool) -> Cluster {
         let reservation = Reservation {
             title: format!("default/t{n}").into(),
             compute: Compute::new(MilliCpu(holder.cpu), Bytes(holder.memory)),
-            groups: Vec::new(),
             standing: Standing {
                 priority: holder.priority,
                 stopping: holder.stopping,
                 executor: executor.map(|e| format!("default/t{e}").into()),
             },
+            ..Reservation::default()
         };
         cluster.book(&uid(n), &name("r1"), reservation);
     }

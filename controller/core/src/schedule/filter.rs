@@ -23,6 +23,7 @@ pub fn refusal(member: &Member, demand: &Demand) -> Option<Refusal> {
     let spec = &*demand.spec;
     identity(member.name.as_str(), facts, spec)
         .or_else(|| executor(member, demand))
+        .or_else(|| apart(member, demand))
         .or_else(|| abilities(facts, spec))
         .or_else(|| too_small(member, spec))
         .or_else(|| admission(facts, spec))
@@ -52,6 +53,31 @@ fn executor(member: &Member, demand: &Demand) -> Option<Refusal> {
     let is_it = |title: &str| title.split_once('/') == Some((namespace, task.as_str()));
     let here = member.ledger.reservations().any(|(_, r)| is_it(&r.title));
     (!here).then(|| Refusal::NoExecutor { task: task.clone() })
+}
+
+/// Tasks that are to be apart are on different nodes.
+fn apart(member: &Member, demand: &Demand) -> Option<Refusal> {
+    let word = demand.spec.placement.apart.as_deref()?;
+    let namespace = namespace_of(&demand.title);
+    let here = member
+        .ledger
+        .reservations()
+        .find(|(_, r)| r.apart.as_deref() == Some(word) && namespace_of(&r.title) == namespace);
+    here.map(|(_, r)| Refusal::Apart { task: r.title.to_string() })
+}
+
+/// What of a node stands against a task for as long as both are what they are: not what is busy, lost or cordoned now.
+#[must_use]
+pub fn unsuited(name: &str, facts: &NodeFacts, spec: &TaskSpec) -> Option<Refusal> {
+    let resources = &spec.resources;
+    let joined = || {
+        let message = "its agent has not joined".to_owned();
+        facts.runtimes.is_empty().then_some(Refusal::NotReady { message })
+    };
+    identity(name, facts, spec)
+        .or_else(joined)
+        .or_else(|| functions(facts, &resources.sensors, &resources.actuators))
+        .or_else(|| tainted(facts, spec))
 }
 
 fn abilities(facts: &NodeFacts, spec: &TaskSpec) -> Option<Refusal> {
@@ -88,13 +114,18 @@ fn too_small(member: &Member, spec: &TaskSpec) -> Option<Refusal> {
     ready.then_some(Refusal::TooSmall { shortage })
 }
 
-fn admission(facts: &NodeFacts, spec: &TaskSpec) -> Option<Refusal> {
+fn tainted(facts: &NodeFacts, spec: &TaskSpec) -> Option<Refusal> {
     let keeps_away = |t: &&muster_api::kind::node::Taint| {
         t.effect == TaintEffect::NoSchedule
             && !spec.placement.tolerations.iter().any(|o| o.tolerates(t))
     };
-    if let Some(taint) = facts.taints.iter().find(keeps_away) {
-        return Some(Refusal::Tainted { taint: taint.clone() });
+    let taint = facts.taints.iter().find(keeps_away)?;
+    Some(Refusal::Tainted { taint: taint.clone() })
+}
+
+fn admission(facts: &NodeFacts, spec: &TaskSpec) -> Option<Refusal> {
+    if let Some(refusal) = tainted(facts, spec) {
+        return Some(refusal);
     }
     if facts.unschedulable {
         return Some(Refusal::Cordoned);

@@ -48,6 +48,7 @@ impl Demand {
             compute: self.spec.resources.reserved(),
             groups: facts.groups_for(&self.spec.resources.actuators),
             standing: standing(&self.title, &self.spec, false),
+            apart: self.spec.placement.apart.as_deref().map(Into::into),
         }
     }
 }
@@ -125,7 +126,7 @@ fn decide(cluster: &mut Cluster, demands: &mut [Demand], depth: Depth) -> Plan {
     demands.sort_by_key(|d| (std::cmp::Reverse(d.spec.priority), d.since));
     let mut plan = Plan::default();
     // A pass only takes, so what had no place for a task has none for one that asks the same.
-    let mut hopeless: Vec<(Arc<TaskSpec>, Arc<[NodeRefusal]>)> = Vec::new();
+    let mut hopeless: Vec<(&Demand, Arc<[NodeRefusal]>)> = Vec::new();
     let mut accounts = cluster.has_quotas().then(|| Accounts::of(cluster));
     for demand in demands.iter() {
         if let Some(over) = accounts.as_ref().and_then(|a| over_quota(cluster, a, demand)) {
@@ -133,7 +134,7 @@ fn decide(cluster: &mut Cluster, demands: &mut [Demand], depth: Depth) -> Plan {
             plan.waits.push(Wait { uid: demand.uid.clone(), why: [quota_refusal(&over)].into() });
             continue;
         }
-        let known = hopeless.iter().find(|(spec, _)| asks_the_same(spec, &demand.spec));
+        let known = hopeless.iter().find(|(known, _)| asks_the_same(known, demand));
         if let Some((_, why)) = known {
             plan.waits.push(Wait { uid: demand.uid.clone(), why: Arc::clone(why) });
             continue;
@@ -165,7 +166,7 @@ fn decide(cluster: &mut Cluster, demands: &mut [Demand], depth: Depth) -> Plan {
                 if hopeless.len() == HOPELESS_KEPT {
                     hopeless.remove(0);
                 }
-                hopeless.push((Arc::clone(&demand.spec), Arc::clone(&why)));
+                hopeless.push((demand, Arc::clone(&why)));
                 plan.waits.push(Wait { uid: demand.uid.clone(), why });
             }
         }
@@ -196,13 +197,15 @@ pub fn quota_refusal(over: &OverQuota) -> NodeRefusal {
 /// memory would cost more in comparing than it saves in scanning.
 const HOPELESS_KEPT: usize = 8;
 
-fn asks_the_same(a: &TaskSpec, b: &TaskSpec) -> bool {
-    a.resources == b.resources
-        && a.preemption == b.preemption
-        && a.placement == b.placement
-        && a.run.container.is_some() == b.run.container.is_some()
-        && a.run.executor.is_none()
-        && b.run.executor.is_none()
+fn asks_the_same(a: &Demand, b: &Demand) -> bool {
+    let (one, other) = (&a.spec, &b.spec);
+    one.resources == other.resources
+        && one.preemption == other.preemption
+        && one.placement == other.placement
+        && one.run.container.is_some() == other.run.container.is_some()
+        && one.run.executor.is_none()
+        && other.run.executor.is_none()
+        && (one.placement.apart.is_none() || namespace_of(&a.title) == namespace_of(&b.title))
 }
 
 pub(crate) fn take(cluster: &mut Cluster, demand: &Demand, slot: Slot) -> Bind {
@@ -230,6 +233,9 @@ fn choose(cluster: &Cluster, demand: &Demand) -> Option<Slot> {
         let slot = cluster.slot_of(node)?;
         return filter::refusal(cluster.at(slot), demand).is_none().then_some(slot);
     }
+    if let Some(slot) = preferred(cluster, demand) {
+        return Some(slot);
+    }
     let mut second_best = None;
     // A kind that the task does not allow is not scanned: thousands of nodes would say the same.
     if spec.resources.is_compute_only() && spec.allows_kind(NodeKind::Cloud) {
@@ -248,6 +254,12 @@ fn choose(cluster: &Cluster, demand: &Demand) -> Option<Slot> {
         (Some(_), Cost::TravelTime) => best_scored(cluster, demand, &mut second_best),
     };
     robot.or(second_best)
+}
+
+/// The node that the task asks to be tried first, when it takes the task.
+fn preferred(cluster: &Cluster, demand: &Demand) -> Option<Slot> {
+    let slot = cluster.slot_of(demand.spec.placement.prefer.as_deref()?)?;
+    filter::refusal(cluster.at(slot), demand).is_none().then_some(slot)
 }
 
 /// Whether a taint asks to leave the node for last.
@@ -338,6 +350,7 @@ fn hardness(refusal: &Refusal) -> u8 {
         Refusal::LeaseHeld { .. }
         | Refusal::Exhausted { .. }
         | Refusal::Kept { .. }
+        | Refusal::Apart { .. }
         | Refusal::NoExecutor { .. } => 0,
         Refusal::OutOfRange { .. } | Refusal::NoPose | Refusal::NotLocalized => 1,
         Refusal::NotReady { .. } | Refusal::Cordoned | Refusal::Tainted { .. } => 2,

@@ -1,0 +1,154 @@
+//! Whether a task is ready, available, or has failed its template. The one place that probes plug into.
+//!
+//! A task is *ready* when it runs and its probe, if it has one, says so; *available* when it has run for
+//! `minReadySeconds` as well. The time it runs is by its node's clock, so a clock that is ahead makes it available late;
+//! with `minReadySeconds: 0` no clock is looked at.
+
+use std::fmt;
+use std::time::Duration;
+
+use jiff::Timestamp;
+use muster_api::phase::TaskPhase;
+
+use super::after;
+use super::view::{NodeView, TaskView};
+
+/// How well a task is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Health {
+    /// It serves.
+    Available,
+    /// It runs and is ready, and serves from then on.
+    Ready {
+        /// When.
+        available_at: Timestamp,
+    },
+    /// It does not serve.
+    NotReady,
+}
+
+/// How well a task is as of `now`.
+#[must_use]
+pub fn health(task: &TaskView, min_ready: Duration, now: Timestamp) -> Health {
+    if task.phase != TaskPhase::Running || task.ready == Some(false) {
+        return Health::NotReady;
+    }
+    let available_at = after(task.started.unwrap_or(task.created), min_ready);
+    if min_ready.is_zero() || available_at <= now {
+        Health::Available
+    } else {
+        Health::Ready { available_at }
+    }
+}
+
+/// What a task did that its template is blamed for.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Fault {
+    /// Its program ended, or could not be started.
+    Crashed {
+        /// What its node says about it.
+        message: String,
+    },
+    /// It runs, and its probe did not say that it is ready in time.
+    ProbeFailed {
+        /// How long it had, seconds.
+        deadline: u64,
+    },
+    /// It did not get as far as running in time.
+    DeadlineExceeded {
+        /// How long it had, seconds.
+        deadline: u64,
+        /// Where it was then.
+        phase: TaskPhase,
+        /// What is said about that.
+        message: String,
+    },
+}
+
+impl Fault {
+    /// The fault as one word, for programs.
+    #[must_use]
+    pub fn reason(&self) -> &'static str {
+        match self {
+            Fault::Crashed { .. } => "Crashed",
+            Fault::ProbeFailed { .. } => "ProbeFailed",
+            Fault::DeadlineExceeded { .. } => "ProgressDeadlineExceeded",
+        }
+    }
+}
+
+impl fmt::Display for Fault {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Fault::Crashed { message } if message.is_empty() => f.write_str("ended by itself"),
+            Fault::Crashed { message } => write!(f, "crashed: {message}"),
+            Fault::ProbeFailed { deadline } => {
+                write!(f, "ran and was not ready within {deadline} s")
+            }
+            Fault::DeadlineExceeded { deadline, phase, message } => {
+                write!(f, "was still {phase} after {deadline} s")?;
+                if message.is_empty() { Ok(()) } else { write!(f, ": {message}") }
+            }
+        }
+    }
+}
+
+/// Ends that say nothing about the template: somebody else brought them about.
+const NOT_ITS_FAULT: [&str; 7] = [
+    "NodeFenced",
+    "Disconnected",
+    "NodeRebooted",
+    "ShimLost",
+    "ContainerLost",
+    "Stopped",
+    "AssignmentUnreadable",
+];
+
+/// What a task of a new template did wrong as of `now`. `node`: where it is or waits to be.
+#[must_use]
+pub fn fault(
+    task: &TaskView,
+    node: Option<&NodeView>,
+    deadline: Duration,
+    now: Timestamp,
+) -> Option<Fault> {
+    use TaskPhase::{Bound, Failed, Pending, Running, Starting, Stopping, Succeeded, Unknown};
+    let crashed = || Some(Fault::Crashed { message: task.message.clone() });
+    match task.phase {
+        // It is ending, or nobody knows.
+        Stopping | Unknown => return None,
+        Failed | Succeeded if NOT_ITS_FAULT.contains(&task.reason.as_str()) => return None,
+        Failed | Succeeded => return crashed(),
+        // Back-off follows a crash and a start that failed; an attempt after one that exited, a crash that is over.
+        Starting if task.reason == "BackOff" => return crashed(),
+        Starting | Running if task.attempt > 1 && task.exited => return crashed(),
+        Starting | Running | Bound | Pending => {}
+    }
+    if is_excused(task) || due(task, node, deadline) > now {
+        return None;
+    }
+    let deadline = deadline.as_secs();
+    match task.phase {
+        Running if task.ready == Some(false) => Some(Fault::ProbeFailed { deadline }),
+        // It may be young: its node was away for long.
+        Running => None,
+        phase => Some(Fault::DeadlineExceeded { deadline, phase, message: task.message.clone() }),
+    }
+}
+
+/// Until when a task has time to become available. While its node could not be reached it had none.
+#[must_use]
+pub fn due(task: &TaskView, node: Option<&NodeView>, deadline: Duration) -> Timestamp {
+    let begun = task.bound.unwrap_or(task.created);
+    after(node.and_then(|n| n.ready_since).map_or(begun, |ready| ready.max(begun)), deadline)
+}
+
+/// Refusals that a template has nothing to do with.
+const NOT_ITS_WISH: [&str; 4] = ["NotReady", "Cordoned", "LeaseHeld", "Apart"];
+
+/// It waits for something that its template has nothing to do with: a first place, or a node that was taken from it.
+#[must_use]
+pub fn is_excused(task: &TaskView) -> bool {
+    let blamed = task.refusal.as_ref().is_some_and(|r| !NOT_ITS_WISH.contains(&r.as_str()));
+    task.phase == TaskPhase::Pending && !blamed
+}

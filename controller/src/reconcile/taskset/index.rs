@@ -1,0 +1,182 @@
+//! Which set a change concerns: who controls which task, which tasks nobody controls, and the nodes as sets see them.
+
+use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::sync::Arc;
+
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::ObjectMeta;
+use muster_api::kind::node::Node;
+use muster_api::kind::taskset::TaskSet;
+use muster_api::selector::{LabelSelector, Labels};
+use muster_controller_core::taskset::view::{NodeView, TaskView};
+use serde::Deserialize;
+
+use crate::objects::{self, NODES, REVISIONS, TASK_SETS, TASKS};
+use crate::store::{Change, Key, Stored};
+
+/// What is remembered of a set.
+#[derive(Debug)]
+struct Set {
+    key: Key,
+    selector: LabelSelector,
+}
+
+/// Who belongs to whom.
+#[derive(Debug, Default)]
+pub(super) struct Index {
+    /// By uid.
+    sets: HashMap<Box<str>, Set>,
+    /// Every task, and the uid of its controller.
+    tasks: BTreeMap<Key, Option<String>>,
+    /// Tasks by the uid of their controller.
+    controlled: HashMap<String, BTreeSet<Key>>,
+    /// Tasks with labels that nobody controls.
+    loose: BTreeMap<Key, Labels>,
+    nodes: BTreeMap<String, NodeView>,
+    dirty: BTreeSet<Key>,
+}
+
+/// The part of an object that says whose it is.
+#[derive(Debug, Deserialize)]
+struct Whose {
+    metadata: ObjectMeta,
+}
+
+impl Whose {
+    fn controller(&self) -> Option<String> {
+        let mut owners = self.metadata.owner_references.iter().flatten();
+        owners.find(|o| o.controller == Some(true)).map(|o| o.uid.clone())
+    }
+}
+
+impl Index {
+    pub(super) fn take_in(&mut self, change: Change, stored: &Arc<Stored>) {
+        let resource = stored.key.resource;
+        if resource == TASKS {
+            self.take_in_task(change, stored);
+        } else if resource == NODES {
+            self.take_in_node(change, stored);
+        } else if resource == TASK_SETS {
+            self.take_in_set(change, stored);
+        } else if resource == REVISIONS
+            && let Some(owner) = objects::read::<Whose>(stored).and_then(|w| w.controller())
+        {
+            self.mark_uid(&owner);
+        }
+    }
+
+    fn take_in_set(&mut self, change: Change, stored: &Arc<Stored>) {
+        if change == Change::Delete {
+            self.sets.remove(&stored.uid);
+            return;
+        }
+        let Some(set) = objects::read::<TaskSet>(stored) else { return };
+        let selector = set.spec.selects(&stored.key.name);
+        self.sets.insert(stored.uid.clone(), Set { key: stored.key.clone(), selector });
+        self.dirty.insert(stored.key.clone());
+    }
+
+    fn take_in_task(&mut self, change: Change, stored: &Arc<Stored>) {
+        let key = &stored.key;
+        if let Some(Some(before)) = self.tasks.remove(key) {
+            if let Some(keys) = self.controlled.get_mut(&before) {
+                keys.remove(key);
+            }
+            self.mark_uid(&before);
+        }
+        self.loose.remove(key);
+        if change == Change::Delete {
+            // Its name is free for a set that wants it.
+            self.mark_namesakes(key);
+            return;
+        }
+        let whose = objects::read::<Whose>(stored);
+        let controller = whose.as_ref().and_then(Whose::controller);
+        self.tasks.insert(key.clone(), controller.clone());
+        match (controller, whose.and_then(|w| w.metadata.labels)) {
+            (Some(uid), _) => {
+                self.mark_uid(&uid);
+                self.controlled.entry(uid).or_default().insert(key.clone());
+            }
+            (None, Some(labels)) => {
+                let takes = |set: &&Set| {
+                    set.key.namespace() == key.namespace() && set.selector.matches(&labels)
+                };
+                self.dirty.extend(self.sets.values().filter(takes).map(|set| set.key.clone()));
+                self.loose.insert(key.clone(), labels);
+            }
+            (None, None) => {}
+        }
+    }
+
+    fn take_in_node(&mut self, change: Change, stored: &Arc<Stored>) {
+        let node = (change == Change::Put).then(|| objects::read::<Node>(stored)).flatten();
+        let view = node.map(|node| NodeView::of(&node));
+        let name = stored.key.name.to_string();
+        // Nodes are written with every placement; few of those changes concern a set.
+        if self.nodes.get(&name) == view.as_ref() {
+            return;
+        }
+        match view {
+            Some(view) => drop(self.nodes.insert(name, view)),
+            None => drop(self.nodes.remove(&name)),
+        }
+        self.dirty.extend(self.sets.values().map(|set| set.key.clone()));
+    }
+
+    fn mark_uid(&mut self, uid: &str) {
+        if let Some(set) = self.sets.get(uid) {
+            self.dirty.insert(set.key.clone());
+        }
+    }
+
+    fn mark_namesakes(&mut self, task: &Key) {
+        let of = |set: &&Set| {
+            let rest = task.name.strip_prefix(&*set.key.name);
+            set.key.namespace() == task.namespace() && rest.is_some_and(|r| r.starts_with('-'))
+        };
+        self.dirty.extend(self.sets.values().filter(of).map(|set| set.key.clone()));
+    }
+
+    /// A set is to be looked at.
+    pub(super) fn mark(&mut self, key: Key) {
+        self.dirty.insert(key);
+    }
+
+    pub(super) fn is_dirty(&self) -> bool {
+        !self.dirty.is_empty()
+    }
+
+    /// The sets to look at.
+    pub(super) fn take_dirty(&mut self) -> BTreeSet<Key> {
+        std::mem::take(&mut self.dirty)
+    }
+
+    pub(super) fn nodes(&self) -> &BTreeMap<String, NodeView> {
+        &self.nodes
+    }
+
+    /// The tasks of a set, and those that it could take in, in the order of their names.
+    pub(super) fn tasks_of(
+        &self,
+        uid: &str,
+        namespace: &str,
+        selector: &LabelSelector,
+    ) -> BTreeSet<Key> {
+        let first = Key::namespaced(TASKS, namespace, "");
+        let loose = self.loose.range(first..).take_while(|(k, _)| k.namespace() == Some(namespace));
+        let loose = loose.filter(|(_, labels)| selector.matches(labels)).map(|(key, _)| key);
+        self.controlled.get(uid).into_iter().flatten().chain(loose).cloned().collect()
+    }
+
+    /// Names that begin as those of a set's tasks do and belong to other tasks.
+    pub(super) fn names(&self, set: &Key, tasks: &[TaskView]) -> BTreeSet<String> {
+        let prefix = format!("{}-", set.name);
+        let namespace = set.namespace().unwrap_or_default();
+        let first = Key::namespaced(TASKS, namespace, prefix.as_str());
+        let same = self.tasks.range(first..).map(|(key, _)| key);
+        let same = same
+            .take_while(|key| key.namespace() == Some(namespace) && key.name.starts_with(&prefix));
+        let others = same.filter(|key| tasks.iter().all(|t| *t.name != *key.name));
+        others.map(|key| key.name.to_string()).collect()
+    }
+}

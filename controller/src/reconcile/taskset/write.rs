@@ -1,0 +1,275 @@
+//! A plan as one transaction, and what people are told when it is done.
+
+use std::sync::Arc;
+
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::{ObjectMeta, OwnerReference};
+use muster_api::kind::node::Node;
+use muster_api::kind::task::Task;
+use muster_api::kind::taskset::{CHANGE_CAUSE, SET_LABEL, TaskSet, TaskTemplate};
+use muster_api::kind::taskset_revision::{TaskSetRevision, TaskSetRevisionSpec};
+use muster_controller_core::taskset::{Action, NewTask, News, Place, Plan};
+
+use crate::context::Context;
+use crate::objects::{self, REVISIONS, TASKS};
+use crate::rest::create::{namespace_guard, prepare_object};
+use crate::rest::delete;
+use crate::rest::failure::Failure;
+use crate::store::{Key, Op, Precondition, StoreError, Stored};
+
+/// What became of a plan.
+pub(super) enum Outcome {
+    /// It is so, or there was nothing to do.
+    Done,
+    /// Something that it relied on is not so any more.
+    Raced,
+    /// Something else does not let it pass.
+    Refused(String),
+}
+
+/// Why a plan has no operations.
+enum Stop {
+    Raced,
+    Refused(Failure),
+}
+
+impl From<Failure> for Stop {
+    fn from(failure: Failure) -> Self {
+        Stop::Refused(failure)
+    }
+}
+
+pub(super) async fn carry_out(
+    context: &Context,
+    stored: &Arc<Stored>,
+    set: &TaskSet,
+    plan: &Plan,
+) -> Result<Outcome, StoreError> {
+    let same = set.status.as_ref() == Some(&plan.status);
+    if same && plan.actions.is_empty() {
+        return Ok(Outcome::Done);
+    }
+    // Everything holds only while the set is what the plan was made for.
+    let mut ops = vec![match same {
+        false => Op::status(stored, &plan.status),
+        true => Op::Check {
+            key: stored.key.clone(),
+            precondition: Precondition::revision(stored.revision),
+        },
+    }];
+    let work = Work { context, stored, set };
+    match work.operations(plan) {
+        Ok(more) => ops.extend(more),
+        Err(Stop::Raced) => return Ok(Outcome::Raced),
+        Err(Stop::Refused(failure)) => return Ok(Outcome::Refused(failure.message().to_owned())),
+    }
+    match context.store.apply(ops).await {
+        Ok(_) => {
+            tell(context, set, plan);
+            Ok(Outcome::Done)
+        }
+        Err(error) if objects::is_race(&error) => {
+            tracing::debug!(set = %stored.key, %error, "a look at a task set came too late");
+            Ok(Outcome::Raced)
+        }
+        Err(error) => Err(error),
+    }
+}
+
+/// What operations are made of.
+struct Work<'a> {
+    context: &'a Context,
+    stored: &'a Stored,
+    set: &'a TaskSet,
+}
+
+impl Work<'_> {
+    fn operations(&self, plan: &Plan) -> Result<Vec<Op>, Stop> {
+        let mut ops = Vec::new();
+        let creates = |a: &Action| matches!(a, Action::Create(_) | Action::CreateRevision { .. });
+        if plan.actions.iter().any(creates) {
+            ops.extend(namespace_guard(self.context, TASKS, self.namespace())?);
+        }
+        for action in &plan.actions {
+            match action {
+                Action::CreateRevision { name, number } => {
+                    ops.push(self.new_revision(name, *number)?)
+                }
+                Action::Renumber { name, number } => {
+                    ops.push(self.revision(name, |revision| revision.spec.revision = *number)?);
+                }
+                Action::AdoptRevision { name } => {
+                    ops.push(self.revision(name, |r| self.own(&mut r.metadata))?);
+                }
+                Action::DeleteRevision { name } => {
+                    let present = self.get(&self.revision_key(name))?;
+                    ops.push(Op::remove(present.key.clone(), present.revision));
+                }
+                Action::Adopt { task } => ops.push(self.task(task, |t| self.own(&mut t.metadata))?),
+                Action::Release { task } => {
+                    ops.push(self.task(task, |t| self.disown(&mut t.metadata))?);
+                }
+                Action::Create(new) => ops.push(self.new_task(new, plan)?),
+                Action::Delete { task, .. } => ops.extend(self.deletion(task)?),
+            }
+        }
+        Ok(ops)
+    }
+
+    fn namespace(&self) -> &str {
+        self.stored.key.namespace().unwrap_or_default()
+    }
+
+    fn task_key(&self, name: &str) -> Key {
+        Key::namespaced(TASKS, self.namespace(), name)
+    }
+
+    fn revision_key(&self, name: &str) -> Key {
+        Key::namespaced(REVISIONS, self.namespace(), name)
+    }
+
+    fn get(&self, key: &Key) -> Result<Arc<Stored>, Stop> {
+        self.context.store.get(key).ok_or(Stop::Raced)
+    }
+
+    fn owner(&self) -> OwnerReference {
+        OwnerReference {
+            api_version: muster_api::API_VERSION.to_owned(),
+            kind: "TaskSet".to_owned(),
+            name: self.stored.key.name.to_string(),
+            uid: self.stored.uid.to_string(),
+            controller: Some(true),
+            block_owner_deletion: Some(true),
+        }
+    }
+
+    fn own(&self, metadata: &mut ObjectMeta) {
+        metadata.owner_references.get_or_insert_default().push(self.owner());
+    }
+
+    fn disown(&self, metadata: &mut ObjectMeta) {
+        let owners = metadata.owner_references.get_or_insert_default();
+        owners.retain(|o| *o.uid != *self.stored.uid);
+    }
+
+    fn task(&self, name: &str, change: impl FnOnce(&mut Task)) -> Result<Op, Stop> {
+        let present = self.get(&self.task_key(name))?;
+        let mut task: Task = objects::read(&present).ok_or(Stop::Raced)?;
+        change(&mut task);
+        Ok(objects::replace(&present, &task))
+    }
+
+    fn revision(&self, name: &str, change: impl FnOnce(&mut TaskSetRevision)) -> Result<Op, Stop> {
+        let present = self.get(&self.revision_key(name))?;
+        let mut revision: TaskSetRevision = objects::read(&present).ok_or(Stop::Raced)?;
+        change(&mut revision);
+        Ok(objects::replace(&present, &revision))
+    }
+
+    fn new_revision(&self, name: &str, number: u64) -> Result<Op, Stop> {
+        let template = self.set.spec.template.clone();
+        let mut revision =
+            TaskSetRevision::new(name, TaskSetRevisionSpec { revision: number, template });
+        let set = self.stored.key.name.to_string();
+        let metadata = &mut revision.metadata;
+        metadata.namespace = Some(self.namespace().to_owned());
+        metadata.labels = Some([(SET_LABEL.to_owned(), set)].into());
+        let notes = self.set.metadata.annotations.as_ref();
+        let cause = notes.and_then(|notes| notes.get(CHANGE_CAUSE));
+        metadata.annotations = cause.map(|c| [(CHANGE_CAUSE.to_owned(), c.clone())].into());
+        self.own(metadata);
+        self.create(self.revision_key(name), &revision)
+    }
+
+    fn new_task(&self, new: &NewTask, plan: &Plan) -> Result<Op, Stop> {
+        let template = self.template(&new.revision, plan)?;
+        let set = &*self.stored.key.name;
+        let mut task = Task::new(&new.name, template.spec.clone());
+        task.metadata.namespace = Some(self.namespace().to_owned());
+        task.metadata.labels = Some(template.labels(set, &new.revision));
+        let notes = Some(template.metadata.annotations.clone());
+        task.metadata.annotations = notes.filter(|notes| !notes.is_empty());
+        self.own(&mut task.metadata);
+        let placement = &mut task.spec.placement;
+        match &new.place {
+            Place::Anywhere => {}
+            Place::Prefer(node) => placement.prefer = Some(node.clone()),
+            Place::Only(node) => {
+                placement.node = Some(node.clone());
+                placement.prefer = new.follows.then(|| node.clone());
+            }
+        }
+        if self.set.spec.spread && !self.set.spec.every_node {
+            placement.apart.get_or_insert_with(|| set.to_owned());
+        }
+        self.create(self.task_key(&new.name), &task)
+    }
+
+    /// That of the set itself, when the revision is the one that this plan keeps it as.
+    fn template(&self, revision: &str, plan: &Plan) -> Result<TaskTemplate, Stop> {
+        if revision == plan.status.update_revision {
+            return Ok(self.set.spec.template.clone());
+        }
+        let present = self.get(&self.revision_key(revision))?;
+        let revision: TaskSetRevision = objects::read(&present).ok_or(Stop::Raced)?;
+        Ok(revision.spec.template)
+    }
+
+    fn create<T: serde::Serialize>(&self, key: Key, object: &T) -> Result<Op, Stop> {
+        let object = prepare_object(self.context, key.resource, objects::to_value(object))?;
+        Ok(Op::Put { key, value: object, precondition: Precondition::Absent })
+    }
+
+    /// The end of a task; it passes only while its node is not locked.
+    fn deletion(&self, name: &str) -> Result<Vec<Op>, Stop> {
+        let present = self.get(&self.task_key(name))?;
+        let task: Task = objects::read(&present).ok_or(Stop::Raced)?;
+        let mut ops = vec![delete::operation(self.context.clock.now(), &present)];
+        let status = task.status.unwrap_or_default();
+        let node = status.node.filter(|_| !status.phase.is_terminal());
+        if let Some(node) = node.and_then(|n| self.context.store.get(&objects::node_key(&n))) {
+            let locked = objects::read::<Node>(&node).is_some_and(|n| n.mission_lock().is_some());
+            if locked {
+                return Err(Stop::Raced);
+            }
+            let precondition = Precondition::revision(node.revision);
+            ops.push(Op::Check { key: node.key.clone(), precondition });
+        }
+        Ok(ops)
+    }
+}
+
+/// Puts into Events what a plan did.
+fn tell(context: &Context, set: &TaskSet, plan: &Plan) {
+    for action in &plan.actions {
+        match action {
+            Action::Create(new) => {
+                context.events.set(
+                    set,
+                    "Created",
+                    format!("task {} of {}", new.name, new.revision),
+                );
+            }
+            Action::Delete { task, why } => {
+                context.events.set(set, "Ended", format!("task {task}: {why}"));
+            }
+            Action::Adopt { task } => context.events.set(set, "Adopted", format!("task {task}")),
+            Action::Release { task } => context.events.set(set, "Released", format!("task {task}")),
+            Action::CreateRevision { .. }
+            | Action::Renumber { .. }
+            | Action::AdoptRevision { .. }
+            | Action::DeleteRevision { .. } => {}
+        }
+    }
+    for news in &plan.news {
+        match news {
+            News::RolledBack { from, to, task, fault } => {
+                tracing::warn!(set = set.metadata.name, from, to, task, %fault, "rolled back");
+                let message = format!("{from} is given up for {to}: task {task} {fault}");
+                context.events.warn_set(set, "RolledBack", message);
+            }
+            News::RolledOut { revision } => {
+                context.events.set(set, "RolledOut", format!("all are of {revision}"));
+            }
+        }
+    }
+}
