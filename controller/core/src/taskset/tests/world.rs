@@ -301,7 +301,7 @@ impl World {
                         assert!(!self.spec.rollout.paused, "changed while paused");
                         // What has no place was not taken down.
                         let first = |t: &&TaskView| {
-                            let taken = t.refusal.as_deref() == Some("Apart");
+                            let taken = matches!(t.refusal.as_deref(), Some("Apart" | "LeaseHeld"));
                             t.phase == TaskPhase::Pending
                                 && (t.prefer.is_none() || taken)
                                 && !t.ending
@@ -404,7 +404,10 @@ impl World {
     pub(super) fn templates(&self) -> Vec<String> {
         let number = |t: &TaskView| {
             let revision = self.revisions.iter().find(|r| r.name == t.revision);
-            revision.map_or("?".to_owned(), |r| r.template.metadata.annotations["number"].clone())
+            revision.map_or_else(
+                || "?".to_owned(),
+                |r| r.template.metadata.annotations["number"].clone(),
+            )
         };
         self.tasks.iter().filter(|t| !t.ending && !t.phase.is_terminal()).map(number).collect()
     }
