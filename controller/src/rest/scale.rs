@@ -49,14 +49,15 @@ fn scale_of(set: &Value) -> Value {
     let metadata = &set["metadata"];
     let kept = ["name", "namespace", "uid", "resourceVersion", "creationTimestamp"];
     let kept = kept.iter().filter_map(|f| Some(((*f).to_owned(), metadata.get(*f)?.clone())));
+    let number = |pointer: &str| set.pointer(pointer).and_then(Value::as_u64).unwrap_or(0);
     json!({
         "apiVersion": "autoscaling/v1",
         "kind": "Scale",
         "metadata": kept.collect::<serde_json::Map<_, _>>(),
-        "spec": {"replicas": set.pointer("/spec/replicas").unwrap_or(&Value::from(0))},
+        "spec": {"replicas": number("/spec/replicas")},
         "status": {
-            "replicas": set.pointer("/status/replicas").unwrap_or(&Value::from(0)),
-            "selector": set.pointer("/status/selector").unwrap_or(&Value::from("")),
+            "replicas": number("/status/replicas"),
+            "selector": set.pointer("/status/selector").and_then(Value::as_str).unwrap_or_default(),
         },
     })
 }

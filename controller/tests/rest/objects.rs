@@ -210,7 +210,11 @@ async fn discovery_tells_what_there_is() {
             "quotas/status",
             "tasks",
             "tasks/log",
-            "tasks/status"
+            "tasks/status",
+            "tasksetrevisions",
+            "tasksets",
+            "tasksets/scale",
+            "tasksets/status"
         ]
     );
     let task = list.resources.iter().find(|r| r.name == "tasks").unwrap();

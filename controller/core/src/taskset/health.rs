@@ -143,12 +143,23 @@ pub fn due(task: &TaskView, node: Option<&NodeView>, deadline: Duration) -> Time
     after(node.and_then(|n| n.ready_since).map_or(begun, |ready| ready.max(begun)), deadline)
 }
 
-/// Refusals that a template has nothing to do with.
-const NOT_ITS_WISH: [&str; 4] = ["NotReady", "Cordoned", "LeaseHeld", "Apart"];
+/// Refusals because another task is there.
+const TAKEN: [&str; 2] = ["LeaseHeld", "Apart"];
+/// Refusals because the node takes nothing now.
+const SHUT: [&str; 2] = ["NotReady", "Cordoned"];
+
+/// It has no place and gets none before another task ends: it never had one, or another task was faster. One that was
+/// just created may be placed at once, and one whose node is away goes back there.
+#[must_use]
+pub fn is_stranded(task: &TaskView) -> bool {
+    let taken = task.refusal.as_ref().is_some_and(|r| TAKEN.contains(&r.as_str()));
+    task.phase == TaskPhase::Pending && (task.prefer.is_none() || taken)
+}
 
 /// It waits for something that its template has nothing to do with: a first place, or a node that was taken from it.
 #[must_use]
 pub fn is_excused(task: &TaskView) -> bool {
-    let blamed = task.refusal.as_ref().is_some_and(|r| !NOT_ITS_WISH.contains(&r.as_str()));
+    let others = |r: &String| TAKEN.iter().chain(&SHUT).any(|word| r == word);
+    let blamed = task.refusal.as_ref().is_some_and(|r| !others(r));
     task.phase == TaskPhase::Pending && !blamed
 }

@@ -10,7 +10,7 @@ use muster_api::kind::taskset::{
 use muster_api::name::MAX_NAME_LEN;
 use muster_api::phase::TaskPhase;
 
-use super::health::{Health, health};
+use super::health::{Health, health, is_stranded};
 use super::rollout::Course;
 use super::view::{Claim, NodeView, TaskView};
 use super::{Action, Ending, NewTask, Place, Plan, Snapshot, after};
@@ -145,16 +145,23 @@ impl<'a> Crew<'a> {
     }
 
     /// How many of the wanted ones do not serve, when `plan` is carried out.
+    pub(super) fn missing(&self, plan: &Plan) -> usize {
+        self.wanted().saturating_sub(self.count(plan, Member::is_available))
+    }
+
+    /// How many of those are down: not those for which there is no place, which a rollout would wait for without end.
     pub(super) fn down(&self, plan: &Plan) -> usize {
-        let serves = |m: &&Member<'_>| {
-            m.is_available()
-                && !plan.ends(m.task)
-                && match &self.wanted {
-                    Wanted::Number(_) => true,
-                    Wanted::On(nodes) => m.task.place().is_some_and(|p| nodes.contains(p)),
-                }
+        let waits = |m: &Member<'_>| is_stranded(m.task);
+        self.missing(plan).saturating_sub(self.count(plan, waits))
+    }
+
+    /// How many of the wanted ones are so, when `plan` is carried out.
+    fn count(&self, plan: &Plan, is: impl Fn(&Member<'a>) -> bool) -> usize {
+        let wanted = |m: &Member<'_>| match &self.wanted {
+            Wanted::Number(_) => true,
+            Wanted::On(nodes) => m.task.place().is_some_and(|p| nodes.contains(p)),
         };
-        self.wanted().saturating_sub(self.live.iter().filter(serves).count())
+        self.live.iter().filter(|m| is(m) && !plan.ends(m.task) && wanted(m)).count()
     }
 
     /// Every name of a task that is there.

@@ -7,7 +7,7 @@ use jiff::Timestamp;
 use muster_api::kind::taskset::{Replacing, RolledBack, Strategy};
 use muster_api::phase::TaskPhase;
 
-use super::health::{Fault, due, fault, is_excused};
+use super::health::{Fault, due, fault, is_excused, is_stranded};
 use super::places::{Crew, Member};
 use super::revision::History;
 use super::{Action, Ending, News, Plan, Snapshot, after};
@@ -83,7 +83,7 @@ fn first_fault(
         }
         let node = crew.node(task);
         if let Some(fault) = fault(task, node, deadline, now) {
-            first.get_or_insert((task.name.clone(), fault));
+            first.get_or_insert_with(|| (task.name.clone(), fault));
         }
         let due = due(task, node, deadline);
         if due > now && (task.phase != TaskPhase::Running || task.ready == Some(false)) {
@@ -132,7 +132,9 @@ fn course(
         0 => !old().any(|m| m.task.phase.holds_node()),
         n => available >= n,
     };
-    let begun = new().filter(|m| m.task.phase != TaskPhase::Unknown).count()
+    // One that nobody sees, or that has no place and gets none now, proves nothing: another is tried.
+    let tried = |m: &&Member<'_>| m.task.phase != TaskPhase::Unknown && !is_stranded(m.task);
+    let begun = new().filter(tried).count()
         + plan.status.replacing.iter().filter(|r| r.revision == target).count();
     Course {
         target: target.to_owned(),

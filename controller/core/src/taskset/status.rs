@@ -32,7 +32,7 @@ pub(super) fn write(snapshot: &Snapshot<'_>, crew: &Crew<'_>, course: &Course, p
     let (replicas, ready) = (count(&|_| true), count(&|m| m.health != Health::NotReady));
     let updated = count(&|m| m.task.revision == plan.status.update_revision);
     let arrived = count(&|m| m.task.revision == course.target);
-    let down = number(crew.down(plan));
+    let down = number(crew.missing(plan));
     let status = &mut plan.status;
     status.observed_generation = snapshot.generation;
     status.selector = snapshot.spec.selects(snapshot.name).to_string();

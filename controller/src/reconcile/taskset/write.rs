@@ -183,11 +183,12 @@ impl Work<'_> {
     fn new_task(&self, new: &NewTask, plan: &Plan) -> Result<Op, Stop> {
         let template = self.template(&new.revision, plan)?;
         let set = &*self.stored.key.name;
-        let mut task = Task::new(&new.name, template.spec.clone());
+        let labels = template.labels(set, &new.revision);
+        let TaskTemplate { metadata, spec } = template;
+        let mut task = Task::new(&new.name, spec);
         task.metadata.namespace = Some(self.namespace().to_owned());
-        task.metadata.labels = Some(template.labels(set, &new.revision));
-        let notes = Some(template.metadata.annotations.clone());
-        task.metadata.annotations = notes.filter(|notes| !notes.is_empty());
+        task.metadata.labels = Some(labels);
+        task.metadata.annotations = Some(metadata.annotations).filter(|notes| !notes.is_empty());
         self.own(&mut task.metadata);
         let placement = &mut task.spec.placement;
         match &new.place {

@@ -341,7 +341,7 @@ fn a_template_that_never_served_is_never_called_good() {
 
 #[test]
 fn a_template_that_its_robot_cannot_take_ends_the_rollout_and_a_robot_that_others_took_does_not() {
-    for (refusal, reason) in [("TooSmall", "RolledBack"), ("LeaseHeld", "Canary")] {
+    for (refusal, ends) in [("TooSmall", true), ("LeaseHeld", false), ("Cordoned", false)] {
         let mut world = three_with(json!({"progressDeadlineSeconds": 20}));
         world.set_template(1);
         let names: Vec<String> = world.nodes.keys().cloned().collect();
@@ -349,9 +349,23 @@ fn a_template_that_its_robot_cannot_take_ends_the_rollout_and_a_robot_that_other
             world.node(&name).facts.unschedulable = true;
         }
         world.steps(4);
-        assert_eq!(world.task("set-0").phase, TaskPhase::Pending);
-        world.task("set-0").refusal = Some(refusal.to_owned());
-        world.steps(20);
-        assert_eq!(world.progressing().0, reason, "{refusal}");
+        let task = world.task("set-0");
+        assert_eq!(task.phase, TaskPhase::Pending);
+        task.refusal = Some(refusal.to_owned());
+        world.now = super::after(world.now, std::time::Duration::from_secs(40));
+        world.decide();
+        assert_eq!(world.status.rolled_back_from.is_some(), ends, "{refusal}");
+    }
+}
+
+#[test]
+fn tasks_that_have_no_place_hold_no_rollout_up() {
+    let mut world = World::new(json!({"replicas": 5}), 4);
+    world.settle();
+    for round in 0..3 {
+        world.set_template((round + 1) % 2);
+        world.settle();
+        let number = ((round + 1) % 2).to_string();
+        assert!(world.templates().iter().all(|t| *t == number), "{:?}", world.templates());
     }
 }

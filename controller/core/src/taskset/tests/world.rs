@@ -201,6 +201,11 @@ impl World {
                 .map(|(name, _)| name)
                 .collect();
             takes.sort_by_key(|name| task.prefer.as_ref() != Some(name));
+            let prefers = task.prefer.as_ref().filter(|_| takes.is_empty());
+            task.refusal = prefers.map(|node| match is_shut(&self.nodes[node]) {
+                true => "NotReady".to_owned(),
+                false => "Apart".to_owned(),
+            });
             if let Some(node) = takes.first() {
                 task.node = Some((*node).clone());
                 task.phase = TaskPhase::Bound;
@@ -294,7 +299,15 @@ impl World {
                         assert_ne!(task.phase, TaskPhase::Unknown, "nobody knows what it does");
                         assert_ne!(*revision, task.revision);
                         assert!(!self.spec.rollout.paused, "changed while paused");
-                        let down = self.wanted().saturating_sub(serving.len());
+                        // What has no place was not taken down.
+                        let first = |t: &&TaskView| {
+                            let taken = matches!(t.refusal.as_deref(), Some("Apart" | "LeaseHeld"));
+                            t.phase == TaskPhase::Pending
+                                && (t.prefer.is_none() || taken)
+                                && !t.ending
+                        };
+                        let waits = self.tasks.iter().filter(first).count();
+                        let down = self.wanted().saturating_sub(serving.len() + waits);
                         assert!(!served || down <= most, "{down} down, {most} allowed: {action:?}");
                     }
                 }
@@ -391,7 +404,10 @@ impl World {
     pub(super) fn templates(&self) -> Vec<String> {
         let number = |t: &TaskView| {
             let revision = self.revisions.iter().find(|r| r.name == t.revision);
-            revision.map_or("?".to_owned(), |r| r.template.metadata.annotations["number"].clone())
+            revision.map_or_else(
+                || "?".to_owned(),
+                |r| r.template.metadata.annotations["number"].clone(),
+            )
         };
         self.tasks.iter().filter(|t| !t.ending && !t.phase.is_terminal()).map(number).collect()
     }
