@@ -1,5 +1,6 @@
 //! What happens to a framework, as a stream.
 
+use std::collections::VecDeque;
 use std::future::poll_fn;
 use std::pin::Pin;
 use std::sync::Arc;
@@ -55,7 +56,8 @@ const MOST_WAITING: usize = 1024;
 pub(crate) fn channel() -> (Outlet, Inlet) {
     let (sender, events) = mpsc::unbounded_channel();
     let waiting = Arc::new(AtomicUsize::new(0));
-    (Outlet { sender, waiting: Arc::clone(&waiting) }, Inlet { events, waiting })
+    let inlet = Inlet { events, waiting: Arc::clone(&waiting), heard: VecDeque::new() };
+    (Outlet { sender, waiting }, inlet)
 }
 
 /// The session's end of the stream. It never waits for the framework's code, which may itself wait for an answer that
@@ -92,6 +94,61 @@ impl Outlet {
 pub(crate) struct Inlet {
     events: mpsc::UnboundedReceiver<Event>,
     waiting: Arc<AtomicUsize>,
+    /// What has come and is not given yet.
+    heard: VecDeque<Event>,
+}
+
+impl Inlet {
+    /// The next event. What came after it is looked at first: an offer that is over is not given any more, so a
+    /// framework that has moved, or was busy, does not launch on what it was offered before.
+    fn poll(&mut self, context: &mut Context<'_>) -> Poll<Option<Event>> {
+        let closed = loop {
+            match self.events.poll_recv(context) {
+                Poll::Ready(Some(event)) => self.hear(event),
+                Poll::Ready(None) => break true,
+                Poll::Pending => break false,
+            }
+        };
+        match self.heard.pop_front() {
+            Some(event) => {
+                self.waiting.fetch_sub(1, Ordering::Relaxed);
+                Poll::Ready(Some(event))
+            }
+            None if closed => Poll::Ready(None),
+            None => Poll::Pending,
+        }
+    }
+
+    fn hear(&mut self, mut event: Event) {
+        match &mut event {
+            Event::Rescinded { offers: over, .. } => {
+                self.withdraw(|offer| {
+                    let index = over.iter().position(|id| *id == offer.id);
+                    index.map(|index| over.swap_remove(index)).is_some()
+                });
+                if over.is_empty() {
+                    self.waiting.fetch_sub(1, Ordering::Relaxed);
+                    return;
+                }
+            }
+            Event::Disconnected => self.withdraw(|_| true),
+            _ => {}
+        }
+        self.heard.push_back(event);
+    }
+
+    /// Takes offers out that were not given yet.
+    fn withdraw(&mut self, mut is_over: impl FnMut(&proto::Offer) -> bool) {
+        let before = self.heard.len();
+        self.heard.retain_mut(|event| match event {
+            Event::Offers(offers) => {
+                offers.retain(|offer| !is_over(offer));
+                !offers.is_empty()
+            }
+            _ => true,
+        });
+        self.waiting.fetch_sub(before - self.heard.len(), Ordering::Relaxed);
+    }
 }
 
 /// The events of one framework. Ends after [`Event::Error`] or when the framework is stopped. Dropping it ends the
@@ -110,11 +167,7 @@ impl EventStream {
     }
 
     fn poll(&mut self, context: &mut Context<'_>) -> Poll<Option<Event>> {
-        let polled = self.inlet.events.poll_recv(context);
-        if let Poll::Ready(Some(_)) = polled {
-            self.inlet.waiting.fetch_sub(1, Ordering::Relaxed);
-        }
-        polled
+        self.inlet.poll(context)
     }
 }
 
@@ -129,6 +182,33 @@ impl Stream for EventStream {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[tokio::test]
+    async fn an_offer_that_is_over_is_not_given() {
+        let (outlet, inlet) = channel();
+        let session = AbortOnDropHandle::new(tokio::spawn(async {}));
+        let mut stream = EventStream { inlet, _session: session };
+        let offers = |ids: &[&str]| {
+            let offer =
+                |id: &&str| proto::Offer { id: (*id).to_owned(), ..proto::Offer::default() };
+            Event::Offers(ids.iter().map(offer).collect())
+        };
+        let rescinded = |ids: &[&str]| Event::Rescinded {
+            offers: ids.iter().map(|id| (*id).to_owned()).collect(),
+            reason: proto::RescindReason::Closer,
+        };
+        outlet.send(offers(&["1", "2"]));
+        outlet.send(offers(&["3"]));
+        outlet.send(rescinded(&["3", "2"]));
+        assert_eq!(stream.next().await, Some(offers(&["1"])));
+        outlet.send(rescinded(&["1"]));
+        assert_eq!(stream.next().await, Some(rescinded(&["1"])), "that one was given");
+        outlet.send(offers(&["4"]));
+        outlet.send(Event::Disconnected);
+        assert_eq!(stream.next().await, Some(Event::Disconnected));
+        drop(outlet);
+        assert_eq!(stream.next().await, None);
+    }
 
     #[tokio::test]
     async fn a_framework_that_does_not_read_loses_messages_and_nothing_else() {

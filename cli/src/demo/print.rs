@@ -120,7 +120,7 @@ impl<'a> Out<'a> {
     pub(super) fn disturbed(&mut self, what: &str, others: f64) -> Result<(), CliError> {
         let said =
             format!("  {what}: other processes used {others:.1} cores meanwhile; measuring again");
-        self.say(&self.ui.styles.warn.paint(said).to_string())
+        self.say(&self.ui.styles.warn.paint(said))
     }
 
     /// The result.

@@ -195,7 +195,7 @@ mod tests {
             (deadline.clone(), json!({"phase": "Pending"}), None),
             (deadline.clone(), running.clone(), Some(Due::Stop(at("2026-01-01T00:00:30Z")))),
             (deadline.clone(), stopped, None),
-            (deadline.clone(), over.clone(), Some(Due::Remove(at("2026-01-01T00:01:05Z")))),
+            (deadline, over.clone(), Some(Due::Remove(at("2026-01-01T00:01:05Z")))),
             (json!({"activeDeadlineSeconds": 30}), over, None),
             (json!({"ttlSecondsAfterFinished": 0}), running, None),
             (

@@ -91,6 +91,8 @@ pub enum Request {
         uid: FrameworkUid,
         /// What.
         spec: Box<FrameworkSpec>,
+        /// Told after what was offered for the old wish is rescinded.
+        done: oneshot::Sender<()>,
     },
     /// Offers of everything, again.
     Revive {
@@ -240,6 +242,8 @@ pub(super) struct Desk {
     pending: HashMap<u64, Pending>,
     verdicts: Vec<(Order, Verdict)>,
     next_ticket: u64,
+    /// To be told when what they asked for has been done and said.
+    told: Vec<oneshot::Sender<()>>,
     started: Instant,
 }
 
@@ -253,6 +257,7 @@ impl Desk {
             pending: HashMap::new(),
             verdicts: Vec::new(),
             next_ticket: 1,
+            told: Vec::new(),
             started: Instant::now(),
         }
     }
@@ -302,7 +307,8 @@ impl Desk {
             Request::Subscribe { uid, key, spec, outlet } => {
                 self.subscribe(uid, key, &spec, outlet)
             }
-            Request::Wish { uid, spec } => {
+            Request::Wish { uid, spec, done } => {
+                self.told.push(done);
                 let Some(seat) = self.seats.get(&uid).copied() else { return };
                 let namespace = self.guests[&seat].key.namespace().unwrap_or_default();
                 self.book.set_wish(seat, Wish::new(namespace, &spec));
@@ -409,6 +415,10 @@ impl Desk {
             if let Some(guest) = self.guests.get(&seat) {
                 tell(guest, cluster, self.context.clock.now(), &notice);
             }
+        }
+        for done in self.told.drain(..) {
+            // A session that has ended meanwhile need not be told.
+            let _ = done.send(());
         }
         self.book.next_deadline().map(|at| self.started + at)
     }

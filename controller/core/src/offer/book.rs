@@ -505,6 +505,12 @@ fn end_of(member: &Member, wish: &Wish, offer: &Offer, rewished: bool) -> Option
         }
         Some(_) if rewished => Some(Rescinded::Filtered),
         Some(_) => Some(Rescinded::Changed),
+        // Its score is that of the old position.
+        None if rewished && score_of(member, wish) != offer.score => Some(Rescinded::Filtered),
         None => (member.version != offer.version).then_some(Rescinded::Changed),
     }
+}
+
+fn score_of(member: &Member, wish: &Wish) -> Option<f64> {
+    allocator::score(member.facts.as_ref()?, wish)
 }

@@ -119,7 +119,8 @@ pub enum Rescinded {
     Taken,
     /// The robot is too far away, in another map, or does not know where it is.
     OutOfRange,
-    /// The framework changed its filter or position, and the node does not fit any more.
+    /// The framework changed its filter or position: the node does not fit any more, or has another score, and a fresh
+    /// offer follows.
     Filtered,
     /// The node is not ready, cordoned, tainted or gone.
     NodeLost,

@@ -18,7 +18,7 @@ use muster_api::kind::task::Task;
 use muster_api::wire::framework::v1 as wire;
 use muster_api::wire::framework_session::{set_filter, set_position};
 use muster_controller_core::offer::DEFAULT_REFUSE;
-use tokio::sync::mpsc;
+use tokio::sync::{mpsc, oneshot};
 use tokio::time::{Instant, MissedTickBehavior, interval};
 use tokio_util::sync::CancellationToken;
 use wire::call::Call as Said;
@@ -310,9 +310,12 @@ impl Session {
         }
         self.guest.spec = spec.clone();
         let uid = Arc::clone(&self.guest.uid);
-        self.ask(Request::Wish { uid, spec: Box::new(spec.clone()) }).await?;
+        let (done, rescinded) = oneshot::channel();
+        self.ask(Request::Wish { uid, spec: Box::new(spec.clone()), done }).await?;
         subscribe::write_spec(&self.frameworks.context, &self.guest.key, &self.guest.uid, &spec)
             .await;
+        // Before the answer: who has moved hears nothing of the old place after it.
+        rescinded.await.map_err(|_| Closed)?;
         Ok(None)
     }
 
