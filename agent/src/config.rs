@@ -74,7 +74,7 @@ pub struct Args {
     /// The map that positions are in [default: as given last, else map]
     #[arg(long, value_name = "NAME")]
     pub map: Option<String>,
-    /// Where the robot is: static:X,Y[,YAW], or file:PATH with a line X Y [YAW] that the robot keeps up to date
+    /// Where the robot is: `static:X,Y[,YAW]`, or `file:PATH` with a line `X Y [YAW]` that the robot keeps up to date
     /// [default: as given last]
     #[arg(long, value_name = "SOURCE", allow_hyphen_values = true)]
     pub position: Option<String>,

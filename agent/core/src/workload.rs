@@ -479,8 +479,12 @@ impl Workload {
         content.started_at = exit.started_at.or(content.started_at);
         content.finished_at = Some(exit.finished_at);
         (content.reason, content.message) = explain(exit);
+        // A program that ends well when it is asked to was not let finish either.
+        let obeyed =
+            content.reason == Reason::Completed && matches!(self.state, State::Stopping { .. });
         if let Some(order) = &self.desired.stop
-            && matches!(content.reason, Reason::Error | Reason::StartError | Reason::Killed)
+            && (obeyed
+                || matches!(content.reason, Reason::Error | Reason::StartError | Reason::Killed))
         {
             content.reason = Reason::Stopped;
             content.message.clone_from(&order.reason);

@@ -348,8 +348,12 @@ impl Cluster {
         reservation: Reservation,
     ) -> Result<(), Denied> {
         let priority = reservation.standing.priority;
-        self.members[slot as usize].ledger.reserve(uid, reservation)?;
-        *self.priorities.entry(priority).or_default() += 1;
+        let ledger = &mut self.members[slot as usize].ledger;
+        let is_new = ledger.reservation(uid).is_none();
+        ledger.reserve(uid, reservation)?;
+        if is_new {
+            *self.priorities.entry(priority).or_default() += 1;
+        }
         self.unnominate(uid);
         self.placed.insert(uid.clone(), slot);
         self.touch(slot);

@@ -117,11 +117,16 @@ impl NodeLedger {
         free
     }
 
-    /// The cpu and memory of [`NodeLedger::free`].
+    /// The cpu and memory of [`NodeLedger::open`].
     #[must_use]
-    pub fn free_cpu_memory(&self) -> (MilliCpu, Bytes) {
+    pub fn open_cpu_memory(&self) -> (MilliCpu, Bytes) {
         let (all, used) = (&self.allocatable, &self.used);
-        (all.cpu.saturating_sub(used.cpu), all.memory.saturating_sub(used.memory))
+        let mut open = (all.cpu.saturating_sub(used.cpu), all.memory.saturating_sub(used.memory));
+        for kept in self.kept.values() {
+            open.0 = open.0.saturating_sub(kept.compute.cpu);
+            open.1 = open.1.saturating_sub(kept.compute.memory);
+        }
+        open
     }
 
     /// Whether any conflict group has a holder.
@@ -163,6 +168,31 @@ impl NodeLedger {
             groups: reservation.groups.clone(),
         };
         self.kept.insert(uid.clone(), kept);
+    }
+
+    /// Whether exactly this is kept for `uid`.
+    pub(crate) fn keeps(&self, uid: &TaskUid, reservation: &Reservation) -> bool {
+        self.kept.get(uid).is_some_and(|kept| {
+            kept.priority == reservation.standing.priority
+                && kept.compute == reservation.compute
+                && kept.groups == reservation.groups
+        })
+    }
+
+    /// What is left and kept for nobody: what can be offered.
+    #[must_use]
+    pub fn open(&self) -> Compute {
+        let mut open = self.free();
+        for kept in self.kept.values() {
+            open.saturating_sub(&kept.compute);
+        }
+        open
+    }
+
+    /// Whether any conflict group has a holder, or is kept for somebody.
+    #[must_use]
+    pub fn is_any_group_taken(&self) -> bool {
+        self.is_any_group_held() || self.kept.values().any(|k| !k.groups.is_empty())
     }
 
     /// Nothing is kept for `uid` any more. Says whether there was anything.

@@ -12,6 +12,7 @@
 //! after the order finds the same node again, with nobody more to end.
 
 use std::cmp::{Ordering, Reverse};
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use muster_api::id::TaskUid;
@@ -79,7 +80,8 @@ pub(crate) fn make_room(
     for uid in &victims {
         cluster.set_stopping(uid, true);
     }
-    if cluster.nomination(&demand.uid) != Some(slot) {
+    let kept = cluster.at(slot).ledger.keeps(&demand.uid, &reservation);
+    if !kept || cluster.nomination(&demand.uid) != Some(slot) {
         cluster.nominate(&demand.uid, &node, &reservation);
     }
     let ending = ending(&cluster.at(slot).ledger);
@@ -104,6 +106,12 @@ fn choose(cluster: &Cluster, demand: &Demand) -> Option<(Slot, Vec<TaskUid>)> {
         return None;
     }
     let nominated = cluster.nomination(&demand.uid);
+    // Nobody more has to end there: no other node does less harm.
+    if let Some(slot) = nominated
+        && let Some(nobody) = victims(cluster.at(slot), demand).filter(Vec::is_empty)
+    {
+        return Some((slot, nobody));
+    }
     let mut best: Option<(Harm, bool, f64, Slot, Vec<TaskUid>)> = None;
     for (slot, member) in cluster.members() {
         let Some(victims) = victims(member, demand) else { continue };
@@ -147,6 +155,9 @@ fn victims(member: &Member, demand: &Demand) -> Option<Vec<TaskUid>> {
         return None;
     }
     let mut candidates = candidates(&member.ledger, priority);
+    // Work does not end the executor that is to do it.
+    let own = reservation.standing.executor.as_ref();
+    candidates.retain(|c| own != Some(&c.tasks[0].1.title));
     if !need.is_met(&everybody(&candidates)) {
         return None;
     }
@@ -156,7 +167,15 @@ fn victims(member: &Member, demand: &Demand) -> Option<Vec<TaskUid>> {
     // Nobody more important than needed.
     let highest = |c: &Candidate<'_>| c.tasks.iter().map(|(_, r)| r.standing.priority).max();
     candidates.sort_by_key(&highest);
-    let enough = (1..=candidates.len()).find(|n| need.is_met(&everybody(&candidates[..*n])))?;
+    let (mut short, mut enough) = (0, candidates.len());
+    while short + 1 < enough {
+        let middle = short.midpoint(enough);
+        if need.is_met(&everybody(&candidates[..middle])) {
+            enough = middle;
+        } else {
+            short = middle;
+        }
+    }
     let limit = highest(&candidates[enough - 1]);
     candidates.retain(|c| highest(c) <= limit);
     Some(if candidates.len() <= EXACT {
@@ -175,9 +194,10 @@ struct Need<'a> {
 }
 
 impl Need<'_> {
-    /// Whether the task fits when these, and those that are ending already, are gone.
+    /// Whether the task fits when these, in order of their uids, and those that are ending already are gone.
     fn is_met(&self, gone: &[TaskUid]) -> bool {
-        let leaves = |uid: &TaskUid, r: &Reservation| r.standing.stopping || gone.contains(uid);
+        let leaves =
+            |uid: &TaskUid, r: &Reservation| r.standing.stopping || gone.binary_search(uid).is_ok();
         let held = self.reservation.groups.iter().filter_map(|g| self.ledger.group(g).holder);
         for holder in held {
             // Without a reservation it is not a task's: nobody here can end it.
@@ -198,15 +218,17 @@ impl Need<'_> {
 
 /// Who may end for a task of this priority.
 fn candidates(ledger: &NodeLedger, priority: i32) -> Vec<Candidate<'_>> {
-    let mut found = Vec::new();
-    for (uid, reservation) in ledger.reservations() {
-        if reservation.standing.stopping {
-            continue;
+    let alive = || ledger.reservations().filter(|(_, r)| !r.standing.stopping);
+    let mut works: BTreeMap<&str, Vec<(&TaskUid, &Reservation)>> = BTreeMap::new();
+    for (uid, reservation) in alive() {
+        if let Some(executor) = reservation.standing.executor.as_deref() {
+            works.entry(executor).or_default().push((uid, reservation));
         }
+    }
+    let mut found = Vec::new();
+    for (uid, reservation) in alive() {
         let mut tasks = vec![(uid, reservation)];
-        let title = Some(&*reservation.title);
-        let work = |r: &&Reservation| r.standing.executor.as_deref() == title;
-        tasks.extend(ledger.reservations().filter(|(_, r)| work(r) && !r.standing.stopping));
+        tasks.extend(works.get(&*reservation.title).into_iter().flatten());
         if tasks.iter().all(|(_, r)| r.standing.priority < priority) {
             found.push(Candidate { tasks });
         }
@@ -234,7 +256,13 @@ fn harm(ledger: &NodeLedger, victims: &[TaskUid]) -> Harm {
 /// The set with the least harm.
 fn exact(need: &Need<'_>, candidates: &[Candidate<'_>]) -> Vec<TaskUid> {
     let mut best: Option<(Harm, Vec<TaskUid>)> = None;
-    for chosen in 1..1_u32 << candidates.len() {
+    let mut sets: Vec<u32> = (1..1_u32 << candidates.len()).collect();
+    sets.sort_by_key(|set| set.count_ones());
+    for chosen in sets {
+        // Each candidate is at least one more: no larger set has fewer.
+        if best.as_ref().is_some_and(|(_, b)| b.len() < chosen.count_ones() as usize) {
+            break;
+        }
         let set = candidates.iter().enumerate().filter(|(i, _)| chosen >> i & 1 == 1);
         let mut uids: Vec<TaskUid> =
             set.flat_map(|(_, c)| c.tasks.iter().map(|(uid, _)| (*uid).clone())).collect();

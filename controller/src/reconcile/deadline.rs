@@ -43,8 +43,10 @@ fn due(task: &Task) -> Option<Due> {
         return None;
     }
     if status.phase.is_terminal() {
-        // Fenced before it started: it has no end of its own, and is as old as its placement.
-        let ended = status.finished_at.clone().or_else(|| status.bound_at.clone());
+        // Its end is told by the node's clock, which may be wrong: it was not before its placement. One that was fenced
+        // before it started has no end of its own.
+        let bound = status.bound_at.clone();
+        let ended = status.finished_at.clone().into_iter().chain(bound).max_by_key(|t| t.0);
         return after(&ended, task.spec.ttl_seconds_after_finished?).map(Due::Remove);
     }
     if !status.phase.holds_node() || status.stop.is_some() {

@@ -500,7 +500,7 @@ impl Desk {
                 score: offer.score,
                 age_ms: u64::try_from(now.saturating_sub(offer.made_at).as_millis())
                     .unwrap_or(u64::MAX),
-                free: member.ledger.free(),
+                free: member.ledger.open(),
                 actuators: muster_controller_core::offer::allocator::actuators_free(member),
                 shared_with: others
                     .filter(|s| self.book.offers_of(**s).any(|o| o.slot == offer.slot))

@@ -35,7 +35,7 @@ pub(super) async fn order(
     let mut ops = vec![Op::status(of, &status)];
     let mut ended = Vec::new();
     for victim in &preemption.victims {
-        if let Some((op, task)) = end(context, victim, (title, task.spec.priority)) {
+        if let Some((op, task)) = end(context, victim, (title, task.spec.priority))? {
             ops.push(op);
             ended.push(task);
         }
@@ -53,22 +53,34 @@ pub(super) async fn order(
 }
 
 /// The order for one victim; none: it has ended, or has one.
-fn end(context: &Context, victim: &Victim, (title, priority): (&str, i32)) -> Option<(Op, Task)> {
-    let (namespace, name) = victim.title.split_once('/')?;
-    let stored = context.store.get(&Key::namespaced(TASKS, namespace, name))?;
-    if *stored.uid != *victim.uid.as_str() {
-        return None;
-    }
-    let mut task: Task = objects::read(&stored)?;
+///
+/// # Errors
+///
+/// When it has become as important meanwhile: who ends is to be decided anew, for all of them.
+fn end(
+    context: &Context,
+    victim: &Victim,
+    (title, priority): (&str, i32),
+) -> Result<Option<(Op, Task)>, StoreError> {
+    let Some((namespace, name)) = victim.title.split_once('/') else { return Ok(None) };
+    let key = Key::namespaced(TASKS, namespace, name);
+    let stored = context.store.get(&key).filter(|stored| *stored.uid == *victim.uid.as_str());
+    let Some(stored) = stored else { return Ok(None) };
+    let Some(mut task) = objects::read::<Task>(&stored) else { return Ok(None) };
     let own = task.spec.priority;
-    let status = task.status.as_mut()?;
+    if own >= priority {
+        let actual = stored.revision;
+        return Err(StoreError::Conflict { key, expected: actual, actual });
+    }
+    let Some(status) = task.status.as_mut() else { return Ok(None) };
     if !status.phase.holds_node() || status.stop.is_some() {
-        return None;
+        return Ok(None);
     }
     status.stop = Some(StopOrder {
         reason: PREEMPTED.to_owned(),
         message: format!("makes room for {title}, of priority {priority}; its own is {own}"),
         at: MicroTime(context.clock.now()),
     });
-    Some((objects::replace(&stored, &task), task))
+    let op = objects::replace(&stored, &task);
+    Ok(Some((op, task)))
 }

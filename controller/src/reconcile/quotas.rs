@@ -1,7 +1,7 @@
 //! Writes into the status of Quota objects what their namespaces have, from the scheduler's ledger.
 //!
 //! As with `books`: a picture for people and clients, a moment behind. Counting goes over every reservation, so the
-//! scheduler counts at most once in [`EVERY`], and what has not changed is not written.
+//! scheduler counts at most once in `EVERY`, and what has not changed is not written.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError};

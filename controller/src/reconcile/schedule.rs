@@ -339,8 +339,13 @@ impl Scheduler {
         };
         let status = task.status.unwrap_or_default();
         match (status.phase, status.node) {
+            // An old event, from before it was bound: nothing goes back to Pending.
+            (TaskPhase::Pending, _) if self.cluster.node_of(&uid).is_some() => {}
             (TaskPhase::Pending, _) if task.metadata.deletion_timestamp.is_none() => {
-                let since = self.waiting.get(&uid).map_or(stored.revision, |w| w.demand.since);
+                let created =
+                    task.metadata.creation_timestamp.as_ref().map_or(0, |t| t.0.as_second());
+                let fresh = || schedule::since(created, stored.revision);
+                let since = self.waiting.get(&uid).map_or_else(fresh, |w| w.demand.since);
                 let title =
                     format!("{}/{}", stored.key.namespace().unwrap_or_default(), stored.key.name);
                 let demand = Demand {

@@ -99,7 +99,7 @@ pub(super) async fn plan(call: Call) -> Answer {
         let object = muster_api::kind::admit(object).map_err(|v| refused(i, v))?;
         let change = change_of(&context, &object)?;
         if object["kind"] == "Task" && change["action"] == "create" {
-            demands.push(demand(i, &object, revision)?);
+            demands.push(demand(i, &object)?);
         }
         changes.push(change);
     }
@@ -156,7 +156,7 @@ fn holds(present: &Value, asked: &Value) -> bool {
     }
 }
 
-fn demand(index: usize, object: &Value, revision: u64) -> Result<Demand, Failure> {
+fn demand(index: usize, object: &Value) -> Result<Demand, Failure> {
     let task: Task = serde_json::from_value(object.clone())
         .map_err(|e| Failure::bad_request(format!("{}: {e}", element_path("objects", index))))?;
     let namespace = task.metadata.namespace.as_deref().unwrap_or(DEFAULT);
@@ -165,7 +165,8 @@ fn demand(index: usize, object: &Value, revision: u64) -> Result<Demand, Failure
         uid: TaskUid::new(format!("plan-{index}")),
         title: format!("{namespace}/{name}").into(),
         spec: Arc::new(task.spec),
-        since: revision + 1 + index as u64,
+        // After everything that waits.
+        since: u64::MAX / 2 + index as u64,
     })
 }
 

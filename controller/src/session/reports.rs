@@ -17,6 +17,9 @@ use crate::context::Context;
 use crate::objects;
 use crate::store::StoreError;
 
+/// What an agent says of a task that ended because it was told to.
+const STOPPED: &str = "Stopped";
+
 /// Why a report is not applied.
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum ReportError {
@@ -67,9 +70,9 @@ pub(crate) async fn apply(
         status.started_at.clone_from(&started);
         status.finished_at.clone_from(&finished);
         status.report_sequence = report.sequence;
-        // One that was finished before the order came to it has done its work.
-        let unfinished = before == TaskPhase::Stopping || phase == TaskPhase::Failed;
-        if let Some(stop) = status.stop.clone().filter(|_| phase.is_terminal() && unfinished) {
+        // One that was finished, or failed, before the order came to it has an end of its own.
+        let by_order = phase.is_terminal() && report.reason == STOPPED;
+        if let Some(stop) = status.stop.clone().filter(|_| by_order) {
             status.phase = TaskPhase::Failed;
             (status.reason, status.message) = (stop.reason, stop.message);
         }

@@ -176,15 +176,15 @@ pub fn actuators_free(member: &Member) -> bool {
     member
         .facts
         .as_ref()
-        .is_some_and(|facts| !facts.actuators.is_empty() && !member.ledger.is_any_group_held())
+        .is_some_and(|facts| !facts.actuators.is_empty() && !member.ledger.is_any_group_taken())
 }
 
 /// An offer of nothing is none: there must be free CR, a sensor to share, or actuators that nobody holds.
 fn leftovers_refusal(member: &Member, facts: &NodeFacts, wish: &Wish) -> Option<Refusal> {
     let minimum = &wish.filter.minimum;
-    let (cpu, memory) = member.ledger.free_cpu_memory();
+    let (cpu, memory) = member.ledger.open_cpu_memory();
     if minimum.cpu > cpu || minimum.memory > memory || !minimum.extended.is_empty() {
-        let shortage = member.ledger.free().shortage_for(minimum);
+        let shortage = member.ledger.open().shortage_for(minimum);
         if let Some(shortage) = shortage {
             return Some(Refusal::Exhausted { shortage });
         }
@@ -192,7 +192,7 @@ fn leftovers_refusal(member: &Member, facts: &NodeFacts, wish: &Wish) -> Option<
     if cpu.0 > 0 || !facts.sensors.is_empty() || actuators_free(member) {
         return None;
     }
-    let free = member.ledger.free();
+    let free = member.ledger.open();
     let least = muster_api::resource::Compute::new(
         muster_api::quantity::MilliCpu(1),
         muster_api::quantity::Bytes(0),

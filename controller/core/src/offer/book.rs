@@ -55,7 +55,7 @@ impl Refused {
     fn new(member: &Member, score: Option<f64>, until: Monotonic) -> Self {
         Refused {
             until,
-            free: member.ledger.free(),
+            free: member.ledger.open(),
             actuators_free: allocator::actuators_free(member),
             facts_version: member.facts_version,
             score,
@@ -66,7 +66,7 @@ impl Refused {
     fn has_gained(&self, member: &Member, score: Option<f64>) -> bool {
         self.facts_version != member.facts_version
             || (allocator::actuators_free(member) && !self.actuators_free)
-            || self.free.shortage_for(&member.ledger.free()).is_some()
+            || self.free.shortage_for(&member.ledger.open()).is_some()
             || matches!((self.score, score), (Some(then), Some(now)) if is_closer(now, then))
     }
 }

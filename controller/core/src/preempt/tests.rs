@@ -82,6 +82,64 @@ fn what_is_freed_bit_by_bit_is_kept() {
     assert_eq!(cluster.nomination(&TaskUid::new("big")), None);
 }
 
+/// Two that ask the same, of which the later one is nominated: that the earlier one waits says nothing of it.
+#[test]
+fn a_nominated_task_is_looked_at_for_itself() {
+    let mut cluster = cluster(&[("r1", 1000)]);
+    bound(&mut cluster, demand("old", 0, 100, true));
+    let second = || Demand { since: 2, ..demand("second", 5, 100, true) };
+    let first = || Demand { since: 1, ..demand("first", 5, 100, true) };
+    let plan = schedule(&mut cluster, &mut [second()]);
+    assert_eq!(plan.preemptions.len(), 1);
+    let plan = schedule(&mut cluster, &mut [first(), second()]);
+    assert_eq!(plan.preemptions.len(), 1, "{plan:?}");
+    assert_eq!(plan.preemptions[0].uid, TaskUid::new("second"));
+    cluster.release(&TaskUid::new("old"));
+    let plan = schedule(&mut cluster, &mut [first(), second()]);
+    assert_eq!(plan.binds.len(), 1);
+    assert_eq!(plan.binds[0].uid, TaskUid::new("second"));
+}
+
+#[test]
+fn what_is_kept_follows_the_priority_of_its_task() {
+    let mut cluster = cluster(&[("r1", 1000)]);
+    for uid in ["a", "b"] {
+        bound(&mut cluster, demand(uid, 0, 500, false));
+    }
+    assert_eq!(schedule(&mut cluster, &mut [demand("big", 9, 1000, false)]).preemptions.len(), 1);
+    cluster.release(&TaskUid::new("a"));
+    // Its owner thinks better of it.
+    let mut both = [demand("big", 1, 1000, false), demand("small", 5, 400, false)];
+    assert_eq!(schedule(&mut cluster, &mut both).binds, [], "kept with priority 9 in this pass");
+    let plan = schedule(&mut cluster, &mut both);
+    assert_eq!(plan.binds.len(), 1);
+    assert_eq!(plan.binds[0].uid, TaskUid::new("small"));
+}
+
+#[test]
+fn nobody_is_ended_for_room_that_the_quota_does_not_allow() {
+    let mut cluster = cluster(&[("r1", 1000), ("r2", 1000)]);
+    for uid in ["a", "b"] {
+        bound(&mut cluster, demand(uid, 0, 100, true));
+    }
+    let quota = serde_json::from_value(json!({"hard": {"leases": 3}})).expect("a quota");
+    cluster.set_quota("default", Some(quota));
+    let plan = schedule(&mut cluster, &mut [demand("x", 5, 100, true), demand("y", 5, 100, true)]);
+    assert_eq!(plan.preemptions.len(), 1, "{plan:?}");
+    assert!(plan.waits.iter().any(|w| w.why[0].reason == "QuotaExceeded"), "{plan:?}");
+}
+
+#[test]
+fn work_does_not_end_its_own_executor() {
+    let mut cluster = cluster(&[("r1", 1000)]);
+    bound(&mut cluster, demand("executor", 0, 800, false));
+    let mut work = demand("work", 5, 500, false);
+    let spec = Arc::make_mut(&mut work.spec);
+    spec.run = serde_json::from_value(json!({"executor": {"task": "executor"}})).expect("a run");
+    let plan = schedule(&mut cluster, &mut [work]);
+    assert_eq!((plan.binds.len(), plan.preemptions), (0, vec![]));
+}
+
 #[test]
 fn who_may_not_preempt_waits_and_equals_are_spared() {
     let mut cluster = cluster(&[("r1", 1000)]);

@@ -51,7 +51,7 @@ fn executor(member: &Member, demand: &Demand) -> Option<Refusal> {
     let task = &demand.spec.run.executor.as_ref()?.task;
     let namespace = namespace_of(&demand.title);
     let is_it = |title: &str| title.split_once('/') == Some((namespace, task.as_str()));
-    let here = member.ledger.reservations().any(|(_, r)| is_it(&r.title));
+    let here = member.ledger.reservations().any(|(_, r)| is_it(&r.title) && !r.standing.stopping);
     (!here).then(|| Refusal::NoExecutor { task: task.clone() })
 }
 

@@ -35,8 +35,15 @@ pub struct Demand {
     pub title: Arc<str>,
     /// What it is and needs.
     pub spec: Arc<TaskSpec>,
-    /// When it was created, as the store's revision: who waits longest comes first.
+    /// When it was created, by [`since`]: who waits longest comes first.
     pub since: u64,
+}
+
+/// The order of creation: by time, which an object tells in seconds since 1970, and in a second by the store's revision.
+#[must_use]
+pub fn since(created: i64, revision: u64) -> u64 {
+    const REVISION_BITS: u32 = 24;
+    (created.unsigned_abs() << REVISION_BITS) | (revision & ((1 << REVISION_BITS) - 1))
 }
 
 impl Demand {
@@ -134,7 +141,10 @@ fn decide(cluster: &mut Cluster, demands: &mut [Demand], depth: Depth) -> Plan {
             plan.waits.push(Wait { uid: demand.uid.clone(), why: [quota_refusal(&over)].into() });
             continue;
         }
-        let known = hopeless.iter().find(|(known, _)| asks_the_same(known, demand));
+        // One for which room is kept has what others have not.
+        let nominated = cluster.nomination(&demand.uid).is_some();
+        let mut remembered = hopeless.iter().filter(|_| !nominated);
+        let known = remembered.find(|(known, _)| asks_the_same(known, demand));
         if let Some((_, why)) = known {
             plan.waits.push(Wait { uid: demand.uid.clone(), why: Arc::clone(why) });
             continue;
@@ -142,6 +152,12 @@ fn decide(cluster: &mut Cluster, demands: &mut [Demand], depth: Depth) -> Plan {
         let place = choose(cluster, demand);
         if place.is_none() && depth == Depth::Whole {
             if let Some((preemption, why)) = preempt::make_room(cluster, demand) {
+                if let Some(accounts) = accounts.as_mut() {
+                    // It counts already: nobody is ended for room that the quota would not let it have.
+                    let resources = &demand.spec.resources;
+                    let leases = u64::from(!resources.actuators.is_empty());
+                    accounts.add(namespace_of(&demand.title), &resources.reserved(), leases);
+                }
                 plan.waits.push(Wait { uid: demand.uid.clone(), why: [why].into() });
                 plan.preemptions.push(preemption);
                 continue;

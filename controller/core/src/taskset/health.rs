@@ -8,6 +8,7 @@ use std::fmt;
 use std::time::Duration;
 
 use jiff::Timestamp;
+use muster_api::kind::task::{DEADLINE_EXCEEDED, PREEMPTED, PREEMPTING};
 use muster_api::phase::TaskPhase;
 
 use super::after;
@@ -94,7 +95,9 @@ impl fmt::Display for Fault {
 }
 
 /// Ends that say nothing about the template: somebody else brought them about.
-const NOT_ITS_FAULT: [&str; 7] = [
+const NOT_ITS_FAULT: [&str; 9] = [
+    PREEMPTED,
+    DEADLINE_EXCEEDED,
     "NodeFenced",
     "Disconnected",
     "NodeRebooted",
@@ -144,7 +147,7 @@ pub fn due(task: &TaskView, node: Option<&NodeView>, deadline: Duration) -> Time
 }
 
 /// Refusals because another task is there.
-const TAKEN: [&str; 2] = ["LeaseHeld", "Apart"];
+const TAKEN: [&str; 4] = ["LeaseHeld", "Apart", "KeptForAnother", PREEMPTING];
 /// Refusals because the node takes nothing now.
 const SHUT: [&str; 2] = ["NotReady", "Cordoned"];
 

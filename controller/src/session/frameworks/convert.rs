@@ -33,7 +33,7 @@ pub(crate) fn offer(
         labels: facts.map(|f| f.labels.clone().into_iter().collect()).unwrap_or_default(),
         score: offer.score,
         pose: facts.and_then(|f| f.pose.as_ref()).map(pose_to_wire),
-        free: Some(compute_to_wire(&member.ledger.free())),
+        free: Some(compute_to_wire(&member.ledger.open())),
         sensors: names(facts.map(|f| f.sensors.iter().map(ToString::to_string).collect())),
         actuators: names(
             facts
