@@ -168,8 +168,14 @@ impl Index {
         self.controlled.get(uid).into_iter().flatten().chain(loose).cloned().collect()
     }
 
-    /// Names that begin as those of a set's tasks do and belong to other tasks.
-    pub(super) fn names(&self, set: &Key, tasks: &[TaskView]) -> BTreeSet<String> {
+    /// Names that begin as those of a set's tasks do and belong to other tasks. The index may still know a task that is
+    /// gone from the store, whose name is free: `is_there` says so.
+    pub(super) fn names(
+        &self,
+        set: &Key,
+        tasks: &[TaskView],
+        is_there: impl Fn(&Key) -> bool,
+    ) -> BTreeSet<String> {
         let prefix = format!("{}-", set.name);
         let namespace = set.namespace().unwrap_or_default();
         let first = Key::namespaced(TASKS, namespace, prefix.as_str());
@@ -177,6 +183,29 @@ impl Index {
         let same = same
             .take_while(|key| key.namespace() == Some(namespace) && key.name.starts_with(&prefix));
         let others = same.filter(|key| tasks.iter().all(|t| *t.name != *key.name));
-        others.map(|key| key.name.to_string()).collect()
+        others.filter(|key| is_there(key)).map(|key| key.name.to_string()).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::*;
+
+    #[test]
+    fn the_name_of_a_task_that_is_gone_is_free_before_its_event_comes() {
+        let object = json!({
+            "apiVersion": muster_api::API_VERSION, "kind": "Task", "metadata": {"name": "watch-0", "namespace": "lab"},
+            "spec": {"run": {"process": {"command": ["true"]}}},
+        });
+        let bytes = serde_json::to_vec(&object).expect("JSON").into();
+        let key = Key::namespaced(TASKS, "lab", "watch-0");
+        let mut index = Index::default();
+        index.take_in(Change::Put, &Arc::new(Stored { key, revision: 1, uid: "u".into(), bytes }));
+        let set = Key::namespaced(TASK_SETS, "lab", "watch");
+        let taken: Vec<String> = index.names(&set, &[], |_| true).into_iter().collect();
+        assert_eq!(taken, ["watch-0"]);
+        assert!(index.names(&set, &[], |_| false).is_empty());
     }
 }

@@ -124,7 +124,7 @@ async fn look(context: &Context, index: &Index, key: &Key) -> Result<Next, Store
         revisions: &revisions,
         tasks: &tasks,
         nodes: index.nodes(),
-        taken: &index.names(key, &tasks),
+        taken: &index.names(key, &tasks, |other| context.store.get(other).is_some()),
     };
     let mut plan = plan(&snapshot, now);
     for said in std::mem::take(&mut plan.conditions) {
