@@ -33,9 +33,9 @@ use super::path::Object;
 use super::{Answer, Call};
 use crate::session::poses::LivePoses;
 
-/// Between two rounds of one reader: a robot is shown at most 20 times a second, twice as often as trackers and agents
+/// Between two rounds of one reader: a robot is shown at most 40 times a second, four times as often as trackers and agents
 /// say where it is, and nobody waits longer than this for a pose that is there.
-const EVERY: Duration = Duration::from_millis(50);
+const EVERY: Duration = Duration::from_millis(25);
 /// Robots in a piece of an answer, some 64 KiB: what comes after it is read when the reader has taken it.
 const PIECE: usize = 512;
 /// As in watches of objects.

@@ -11,52 +11,42 @@
 //! the reservation is released and the store's next event brings the task back. What this task wrote
 //! itself is known already, and is passed over when the store tells it.
 
+mod write;
+
 use std::collections::{BTreeSet, HashMap, HashSet};
 use std::sync::Arc;
 use std::time::Duration;
 
-use futures::future::join_all;
 use muster_api::id::TaskUid;
 use muster_api::kind::lease::Lease;
 use muster_api::kind::node::Node;
 use muster_api::kind::quota::Quota;
-use muster_api::kind::task::{NodeRefusal, PREEMPTING, Task, TaskSpec, TaskStatus};
+use muster_api::kind::task::{NodeRefusal, Task, TaskSpec};
 use muster_api::name::NodeName;
 use muster_api::phase::TaskPhase;
 use muster_controller_core::cluster::{Cluster, Executor};
 use muster_controller_core::fairness::Accounts;
 use muster_controller_core::ledger::Reservation;
-use muster_controller_core::preempt::Preemption;
 use muster_controller_core::recent::Recent;
-use muster_controller_core::schedule::{self, Bind, Demand, Wait};
+use muster_controller_core::schedule::{self, Demand};
 use tokio::sync::{mpsc, oneshot};
 use tokio::time::Instant;
-use tokio_util::task::AbortOnDropHandle;
 
 use super::books::{Books, Page};
 use super::desk::{self, Desk};
 use super::moves::Moves;
 use super::quotas::{Counter, Counts};
-use super::{RETRY, bind, next_events, preempt, watch_from_now};
+use super::{next_events, watch_from_now};
 use crate::context::Context;
 use crate::objects::{self, LEASES, NODES, QUOTAS, TASKS};
 use crate::session::poses::LivePoses;
-use crate::store::{Change, Event, Op, StoreError, Stored, Watcher};
+use crate::store::{Change, Event, Stored, Watcher};
 
 /// How often changed numbers in a waiting task's reasons are written. New reasons are written at
 /// once; a reason whose numbers move with every bind would write without end.
 const WHY_EVERY: Duration = Duration::from_secs(1);
-/// Reasons written in one pass, so that a thousand waiting tasks do not hold up the next bind.
-const WHY_AT_ONCE: usize = 256;
-
-/// Binds that are rendered at once. Rendering one takes some tens of microseconds and a commit some
-/// milliseconds: a few hundred keep both the disk and this task busy.
-const CHUNK: usize = 256;
-
 /// Questions that wait; they are answered between passes.
 const QUESTIONS: usize = 1024;
-
-type Committed = Result<Vec<Arc<Stored>>, StoreError>;
 
 /// A question to the scheduler.
 #[derive(Debug)]
@@ -479,190 +469,6 @@ impl Scheduler {
         }
         soonest([desk, count])
     }
-
-    async fn bind_all(&mut self, binds: Vec<Bind>) -> Option<Instant> {
-        let context = Arc::clone(&self.context);
-        let _nodes_stay = context.placing.read().await;
-        let results = self.commit(&binds).await;
-        let mut retry = None;
-        for (bind, result) in binds.into_iter().zip(results) {
-            match result {
-                Some(Ok(written)) => {
-                    self.own.extend(written.iter().map(|stored| stored.revision));
-                    tracing::info!(task = %bind.uid, node = %bind.node, score = bind.score, "bound");
-                    metrics::counter!("muster_binds_total").increment(1);
-                    self.waiting.remove(&bind.uid);
-                }
-                Some(Err(error)) => {
-                    self.cluster.release(&bind.uid);
-                    if objects::is_race(&error) {
-                        // What changed arrives as an event and brings the task back, if it still waits.
-                        tracing::debug!(task = %bind.uid, %error, "a bind came too late");
-                    } else {
-                        tracing::warn!(task = %bind.uid, error = crate::app::chain(&error), "a bind is not written");
-                        retry = Some(Instant::now() + RETRY);
-                    }
-                }
-                None => {
-                    self.cluster.release(&bind.uid);
-                    self.waiting.remove(&bind.uid);
-                }
-            }
-            self.dirty.insert(bind.node);
-        }
-        self.binds_after = retry;
-        retry
-    }
-
-    /// Orders the ends of those that make room, each order with its reason in one transaction with the nomination.
-    async fn preempt_all(&mut self, preemptions: Vec<Preemption>) -> Option<Instant> {
-        let mut retry = None;
-        for preemption in preemptions {
-            let Some(waiting) = self.waiting.get_mut(&preemption.uid) else { continue };
-            let title = Arc::clone(&waiting.demand.title);
-            match preempt::order(&self.context, &waiting.stored, &title, &preemption).await {
-                Ok(Some(stored)) => {
-                    self.own.insert(stored.revision);
-                    waiting.stored = stored;
-                }
-                // Nothing new is to be ordered.
-                Ok(None) => {}
-                Err(error) => {
-                    // What was marked as ending is not: the next pass decides anew by what the store says.
-                    for victim in &preemption.victims {
-                        self.cluster.set_stopping(&victim.uid, false);
-                    }
-                    self.cluster.unnominate(&preemption.uid);
-                    if !objects::is_race(&error) {
-                        tracing::warn!(task = %preemption.uid, error = crate::app::chain(&error), "a preemption is not written");
-                    }
-                    retry = Some(Instant::now() + RETRY);
-                }
-            }
-        }
-        retry
-    }
-
-    /// Carries binds out, each as a transaction of its own; the results are in the same order. None: the
-    /// task does not wait any more. The chunks are rendered beside each other, and while one is on its way to
-    /// the disk.
-    async fn commit(&self, binds: &[Bind]) -> Vec<Option<Committed>> {
-        let mut chunks = Vec::with_capacity(binds.len().div_ceil(CHUNK));
-        for chunk in binds.chunks(CHUNK) {
-            let transactions: Vec<Option<Vec<Op>>> =
-                chunk.iter().map(|bind| self.bind_ops(bind)).collect();
-            let store = self.context.store.clone();
-            let apply = async move {
-                let apply = |ops: Option<Vec<Op>>| async { Some(store.apply(ops?).await) };
-                join_all(transactions.into_iter().map(apply)).await
-            };
-            if binds.len() <= CHUNK {
-                return apply.await;
-            }
-            chunks.push(AbortOnDropHandle::new(tokio::spawn(apply)));
-        }
-        let mut results = Vec::with_capacity(binds.len());
-        for chunk in chunks {
-            results.extend(
-                chunk
-                    .await
-                    .expect("a commit does not panic, and nobody aborts it while this waits"),
-            );
-        }
-        results
-    }
-
-    /// The bind as one transaction. None: it does not wait any more.
-    fn bind_ops(&self, bind: &Bind) -> Option<Vec<Op>> {
-        let waiting = self.waiting.get(&bind.uid)?;
-        let now = self.context.clock.now();
-        let mut ops = vec![Op::status(&waiting.stored, &bind::status(bind, now))];
-        ops.extend(bind::grants(&self.context, bind, &waiting.stored.key, now));
-        Some(ops)
-    }
-
-    /// Writes why tasks wait, where it is not written yet.
-    async fn write_reasons(&mut self, waits: Vec<Wait>) -> Option<Instant> {
-        let now = Instant::now();
-        let mut later = None;
-        let mut due = Vec::new();
-        for Wait { uid, why } in waits {
-            let Some(waiting) = self.waiting.get_mut(&uid) else { continue };
-            if waiting.written == why {
-                // One list in memory for all that say the same.
-                waiting.written = why;
-                continue;
-            }
-            let at = waiting.written_at + WHY_EVERY;
-            if (same_reasons(&waiting.written, &why) && at > now) || due.len() == WHY_AT_ONCE {
-                let at = at.max(now + WHY_EVERY / 10);
-                later = Some(later.map_or(at, |l: Instant| l.min(at)));
-                continue;
-            }
-            due.push((Arc::clone(&waiting.stored), uid, why));
-        }
-        let store = &self.context.store;
-        let written = join_all(due.into_iter().map(|(stored, uid, why)| async move {
-            // As in a bind: a task that waits has nothing else in its status.
-            let status = waiting_status(&why);
-            (store.apply_one(Op::status(&stored, &status)).await, uid, why)
-        }))
-        .await;
-        for (result, uid, why) in written {
-            match result {
-                Ok(stored) => self.reasons_written(&uid, stored, why),
-                // What changed arrives as an event and brings the task back, if it still waits.
-                Err(error) if objects::is_race(&error) => {}
-                Err(error) => {
-                    tracing::warn!(task = %uid, error = crate::app::chain(&error), "a task's reasons are not written");
-                }
-            }
-        }
-        later
-    }
-
-    fn reasons_written(&mut self, uid: &TaskUid, stored: Arc<Stored>, why: Arc<[NodeRefusal]>) {
-        self.own.insert(stored.revision);
-        if let Some(waiting) = self.waiting.get_mut(uid) {
-            (waiting.stored, waiting.written, waiting.written_at) = (stored, why, Instant::now());
-        }
-    }
-}
-
-/// The status of a task that waits for these reasons.
-fn waiting_status(why: &[NodeRefusal]) -> TaskStatus {
-    let preempting = why.iter().find(|w| w.reason == PREEMPTING);
-    TaskStatus {
-        reason: preempting.map_or("Unschedulable", |_| PREEMPTING).to_owned(),
-        message: preempting.map_or_else(|| headline(why), |w| format!("{}: {}", w.node, w.message)),
-        nominated_node: preempting.map(|w| w.node.clone()),
-        why: why.to_vec(),
-        ..TaskStatus::default()
-    }
-}
-
-/// The same nodes for the same reasons; numbers in the sentences may differ.
-fn same_reasons(a: &[NodeRefusal], b: &[NodeRefusal]) -> bool {
-    let of = |why: &[NodeRefusal]| -> Vec<(String, String)> {
-        why.iter().map(|w| (w.node.clone(), w.reason.clone())).collect()
-    };
-    of(a) == of(b)
-}
-
-/// The reasons in one line: how many nodes say what.
-fn headline(why: &[NodeRefusal]) -> String {
-    let mut counts: Vec<(&str, usize)> = Vec::new();
-    for refusal in why.iter().filter(|w| !w.node.is_empty()) {
-        match counts.iter_mut().find(|(reason, _)| *reason == refusal.reason) {
-            Some((_, n)) => *n += 1,
-            None => counts.push((&refusal.reason, 1)),
-        }
-    }
-    if counts.is_empty() {
-        return why.first().map(|w| w.message.clone()).unwrap_or_default();
-    }
-    let parts: Vec<String> = counts.iter().map(|(reason, n)| format!("{n} {reason}")).collect();
-    format!("no node takes it: {}", parts.join(", "))
 }
 
 fn soonest<const N: usize>(instants: [Option<Instant>; N]) -> Option<Instant> {
