@@ -41,15 +41,6 @@ pub struct Standing {
     pub executor: Option<Arc<str>>,
 }
 
-/// What is kept for a task while others are ended to make room for it.
-#[derive(Debug, Clone, PartialEq, Eq)]
-struct Kept {
-    title: Arc<str>,
-    priority: i32,
-    compute: Compute,
-    groups: Vec<String>,
-}
-
 /// A conflict group of a robot's actuators.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Group {
@@ -88,7 +79,8 @@ pub struct NodeLedger {
     came: BTreeMap<TaskUid, u64>,
     next: u64,
     groups: BTreeMap<String, Group>,
-    kept: BTreeMap<TaskUid, Kept>,
+    /// What is kept for tasks while others are ended to make room for them.
+    kept: BTreeMap<TaskUid, Reservation>,
 }
 
 impl NodeLedger {
@@ -161,22 +153,12 @@ impl NodeLedger {
 
     /// Keeps room for `uid` from tasks of no more priority.
     pub(crate) fn keep(&mut self, uid: &TaskUid, reservation: &Reservation) {
-        let kept = Kept {
-            title: Arc::clone(&reservation.title),
-            priority: reservation.standing.priority,
-            compute: reservation.compute.clone(),
-            groups: reservation.groups.clone(),
-        };
-        self.kept.insert(uid.clone(), kept);
+        self.kept.insert(uid.clone(), reservation.clone());
     }
 
     /// Whether exactly this is kept for `uid`.
     pub(crate) fn keeps(&self, uid: &TaskUid, reservation: &Reservation) -> bool {
-        self.kept.get(uid).is_some_and(|kept| {
-            kept.priority == reservation.standing.priority
-                && kept.compute == reservation.compute
-                && kept.groups == reservation.groups
-        })
+        self.kept.get(uid) == Some(reservation)
     }
 
     /// What is left and kept for nobody: what can be offered.
@@ -200,12 +182,19 @@ impl NodeLedger {
         self.kept.remove(uid).is_some()
     }
 
-    /// What is kept from a task of this priority, for others.
+    /// What is kept for others from a task of this priority.
+    fn kept_for_others(&self, uid: &TaskUid, priority: i32) -> impl Iterator<Item = &Reservation> {
+        let others = self
+            .kept
+            .iter()
+            .filter(move |(other, kept)| *other != uid && kept.standing.priority >= priority);
+        others.map(|(_, kept)| kept)
+    }
+
+    /// The sum of what is kept for others from a task of this priority.
     pub(crate) fn kept_from(&self, uid: &TaskUid, priority: i32) -> Compute {
         let mut sum = Compute::default();
-        for (_, kept) in self.kept.iter().filter(|(u, k)| *u != uid && k.priority >= priority) {
-            sum.add(&kept.compute);
-        }
+        self.kept_for_others(uid, priority).for_each(|kept| sum.add(&kept.compute));
         sum
     }
 
@@ -216,10 +205,8 @@ impl NodeLedger {
         priority: i32,
         groups: &[String],
     ) -> Option<Arc<str>> {
-        let mut others = self.kept.iter().filter(|(u, k)| *u != uid && k.priority >= priority);
-        others
-            .find(|(_, k)| k.groups.iter().any(|g| groups.contains(g)))
-            .map(|(_, k)| Arc::clone(&k.title))
+        let wants = |kept: &&Reservation| kept.groups.iter().any(|g| groups.contains(g));
+        self.kept_for_others(uid, priority).find(wants).map(|kept| Arc::clone(&kept.title))
     }
 
     /// Whether a reservation would be granted to this task, which may be one that room is kept from.
@@ -242,9 +229,8 @@ impl NodeLedger {
         }
         let mut free = self.free();
         free.saturating_sub(&self.kept_from(uid, priority));
-        let mut others = self.kept.iter().filter(|(u, k)| *u != uid && k.priority >= priority);
-        match (free.shortage_for(compute), others.next()) {
-            (Some(_), Some((_, kept))) => Err(Denied::Kept { title: Arc::clone(&kept.title) }),
+        match (free.shortage_for(compute), self.kept_for_others(uid, priority).next()) {
+            (Some(_), Some(kept)) => Err(Denied::Kept { title: Arc::clone(&kept.title) }),
             _ => Ok(()),
         }
     }
