@@ -57,6 +57,12 @@ impl Recorder {
         self.put(Happening { about: task_reference(task), kind: "Warning", reason, message });
     }
 
+    /// The controller has ordered the end of a task, and says there why.
+    pub fn ordered_to_end(&self, task: &Task, reason: &'static str) {
+        let stop = task.status.as_ref().and_then(|status| status.stop.as_ref());
+        self.warn_task(task, reason, stop.map(|stop| stop.message.clone()).unwrap_or_default());
+    }
+
     /// Something usual about a set of tasks.
     pub fn set(&self, set: &TaskSet, reason: &'static str, message: String) {
         self.put(Happening { about: set_reference(set), kind: "Normal", reason, message });

@@ -11,10 +11,11 @@ use jiff::{SignedDuration, Timestamp};
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::MicroTime;
 use muster_api::kind::task::{DEADLINE_EXCEEDED, StopOrder, Task};
 
-use super::{RETRY, next_events, watch_from_now};
+use super::{again, next_events, watch_from_now};
 use crate::context::Context;
 use crate::objects::{self, TASKS};
-use crate::store::{Change, Key, Op, StoreError, Stored};
+use crate::rest::delete;
+use crate::store::{Change, Key, StoreError, Stored};
 
 /// What becomes of a task when its time has come.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -89,12 +90,7 @@ impl Queue {
 
 /// Works until dropped.
 pub async fn run(context: Arc<Context>) {
-    loop {
-        if let Err(error) = follow(&context).await {
-            tracing::warn!(error = crate::app::chain(&error), "deadlines are not kept yet");
-            tokio::time::sleep(RETRY).await;
-        }
-    }
+    again(&context, "deadlines are not kept yet", follow).await;
 }
 
 /// Looks at every task, then at what changes; ends when it must begin anew.
@@ -146,19 +142,12 @@ async fn act(context: &Context, key: &Key, now: Timestamp) -> Result<(), StoreEr
                 stopped = Some(task);
                 Some(vec![op])
             }
-            Due::Remove(_) if task.metadata.finalizers.as_ref().is_some_and(|f| !f.is_empty()) => {
-                let now = Timestamp::from_second(now.as_second()).unwrap_or(now);
-                let at = k8s_openapi::apimachinery::pkg::apis::meta::v1::Time(now);
-                task.metadata.deletion_timestamp = Some(at);
-                Some(vec![objects::replace(stored, &task)])
-            }
-            Due::Remove(_) => Some(vec![Op::remove(stored.key.clone(), stored.revision)]),
+            Due::Remove(_) => Some(vec![delete::operation(now, stored)]),
         }
     })
     .await?;
     if let Some(task) = stopped {
-        let message = task.status.as_ref().and_then(|s| s.stop.as_ref()).map(|s| s.message.clone());
-        context.events.warn_task(&task, DEADLINE_EXCEEDED, message.unwrap_or_default());
+        context.events.ordered_to_end(&task, DEADLINE_EXCEEDED);
     }
     Ok(())
 }

@@ -10,19 +10,14 @@ use std::sync::Arc;
 use muster_api::kind::task::Task;
 use muster_api::phase::TaskPhase;
 
-use super::{RETRY, next_events, watch_from_now};
+use super::{again, next_events, watch_from_now};
 use crate::context::Context;
 use crate::objects::{self, TASKS};
 use crate::store::{Change, Key, Op, StoreError};
 
 /// Works until dropped.
 pub async fn run(context: Arc<Context>) {
-    loop {
-        if let Err(error) = follow(&context).await {
-            tracing::warn!(error = crate::app::chain(&error), "deleted tasks are not removed yet");
-            tokio::time::sleep(RETRY).await;
-        }
-    }
+    again(&context, "deleted tasks are not removed yet", follow).await;
 }
 
 /// Looks at every task, then at what changes; ends when it must begin anew.

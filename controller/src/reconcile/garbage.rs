@@ -11,7 +11,7 @@ use std::sync::Arc;
 
 use serde_json::Value;
 
-use super::{RETRY, next_events, watch_from_now};
+use super::{again, next_events, watch_from_now};
 use crate::context::Context;
 use crate::rest::delete::delete_object;
 use crate::store::{Change, Key, StoreError, Stored, UpdateError};
@@ -76,12 +76,7 @@ fn owner_uids(object: &Value) -> BTreeSet<String> {
 
 /// Works until dropped.
 pub async fn run(context: Arc<Context>) {
-    loop {
-        if let Err(error) = follow(&context).await {
-            tracing::warn!(error = crate::app::chain(&error), "garbage is not collected yet");
-            tokio::time::sleep(RETRY).await;
-        }
-    }
+    again(&context, "garbage is not collected yet", follow).await;
 }
 
 async fn follow(context: &Context) -> Result<(), StoreError> {

@@ -42,7 +42,7 @@ use crate::context::Context;
 use crate::session::Sessions;
 use crate::session::frameworks::{Frameworks, updates};
 use crate::session::poses::{self, LivePoses};
-use crate::store::{Store, WatchEnd, WatchError, Watcher};
+use crate::store::{Store, StoreError, WatchEnd, WatchError, Watcher};
 
 /// How long a loop waits after the store failed before it tries again. Commits fail when the disk
 /// is full or broken; trying faster only fills the log.
@@ -102,6 +102,21 @@ pub fn spawn_for_frameworks(
     let updates = updates::run(Arc::clone(context), Arc::clone(frameworks));
     tasks.spawn(context.stop.clone().run_until_cancelled_owned(failover));
     tasks.spawn(context.stop.clone().run_until_cancelled_owned(updates));
+}
+
+/// Follows the store, again each time when `follow` ends because it must begin anew; when the store failed, after a
+/// moment, and it is said in `words` what is not done meanwhile.
+pub(crate) async fn again(
+    context: &Context,
+    words: &'static str,
+    follow: impl AsyncFn(&Context) -> Result<(), StoreError>,
+) {
+    loop {
+        if let Err(error) = follow(context).await {
+            tracing::warn!(error = crate::app::chain(&error), "{words}");
+            tokio::time::sleep(RETRY).await;
+        }
+    }
 }
 
 /// The next changes of a watcher, or none when it must begin anew: it fell behind, and only a look

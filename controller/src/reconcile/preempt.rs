@@ -45,9 +45,7 @@ pub(super) async fn order(
     tracing::info!(task = title, %node, victims = ended.len(), "room is made by preemption");
     metrics::counter!("muster_preemptions_total").increment(ended.len() as u64);
     for victim in &ended {
-        let stop = victim.status.as_ref().and_then(|s| s.stop.as_ref());
-        let message = stop.map(|s| s.message.clone()).unwrap_or_default();
-        context.events.warn_task(victim, PREEMPTED, message);
+        context.events.ordered_to_end(victim, PREEMPTED);
     }
     Ok(Some(written))
 }

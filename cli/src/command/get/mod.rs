@@ -12,6 +12,7 @@ use crate::args::Select;
 use crate::client::Selection;
 use crate::error::CliError;
 use crate::output::objects::{self, Format, Group, document, full_name, serialize, table};
+use crate::output::table::Table;
 use crate::session::Session;
 use crate::target::{self, Named};
 use crate::watch::{Change, Follow};
@@ -142,7 +143,7 @@ async fn watch(args: &Args, named: &[Named<'_>], session: &mut Session) -> Outco
     let namespace = (!args.all_namespaces).then_some(session.namespace.as_str());
     let mut follow = Follow::new(&session.client, info, namespace, selection);
     let mut first = BTreeMap::new();
-    let mut printer = Printer { args, info, widths: Vec::new(), head: !args.no_headers };
+    let mut printer = Printer { args, info, rows: Rows::new(!args.no_headers) };
     let mut order = Vec::new();
     let mut synced = false;
     loop {
@@ -164,11 +165,43 @@ async fn watch(args: &Args, named: &[Named<'_>], session: &mut Session) -> Outco
     }
 }
 
+/// A table that goes on: one head, and columns that keep their places.
+struct Rows {
+    widths: Vec<u16>,
+    head: bool,
+}
+
+impl Rows {
+    fn new(head: bool) -> Self {
+        Rows { widths: Vec::new(), head }
+    }
+
+    fn print(&mut self, mut table: Table, session: &mut Session) -> Result<(), CliError> {
+        if !std::mem::take(&mut self.head) {
+            table = table.without_head();
+        }
+        table.at_least(&self.widths);
+        let (text, widths) = table.render(&session.ui.styles);
+        self.widths = widths;
+        session.ui.print(&text)
+    }
+}
+
+/// Objects that come one after the other: a line each as JSON, a document each as YAML.
+fn print_each(objects: &[Value], format: Format, session: &mut Session) -> Result<(), CliError> {
+    objects.iter().try_for_each(|object| match format {
+        Format::Yaml => {
+            let text = document(object, Format::Yaml)?;
+            session.ui.print(&format!("---\n{text}"))
+        }
+        _ => session.ui.line(&object.to_string()),
+    })
+}
+
 struct Printer<'a> {
     args: &'a Args,
     info: &'static KindInfo,
-    widths: Vec<u16>,
-    head: bool,
+    rows: Rows,
 }
 
 impl Printer<'_> {
@@ -181,27 +214,15 @@ impl Printer<'_> {
             Format::Name => {
                 objects.iter().try_for_each(|object| session.ui.line(&full_name(self.info, object)))
             }
-            Format::Json => {
-                objects.iter().try_for_each(|object| session.ui.line(&object.to_string()))
-            }
-            Format::Yaml => objects.iter().try_for_each(|object| {
-                let text = document(object, Format::Yaml)?;
-                session.ui.print(&format!("---\n{text}"))
-            }),
+            Format::Json | Format::Yaml => print_each(&objects, self.args.output, session),
         }
     }
 
     fn print_rows(&mut self, objects: Vec<Value>, session: &mut Session) -> Result<(), CliError> {
         let group = Group { info: self.info, objects };
         let wide = self.args.output == Format::Wide;
-        let mut table = objects::table(&group, wide, self.args.all_namespaces, false);
-        if !std::mem::take(&mut self.head) {
-            table = table.without_head();
-        }
-        table.at_least(&self.widths);
-        let (text, widths) = table.render(&session.ui.styles);
-        self.widths = widths;
-        session.ui.print(&text)
+        let table = objects::table(&group, wide, self.args.all_namespaces, false);
+        self.rows.print(table, session)
     }
 
     /// What is gone is said, not shown as if it were still there.

@@ -5,7 +5,7 @@ use muster_api::pose::Pose;
 use serde::Deserialize;
 use serde_json::{Value, json};
 
-use super::Args;
+use super::{Args, Rows, print_each};
 use crate::client::{group_path, segment, with_query};
 use crate::command::{FirstError, Outcome};
 use crate::error::CliError;
@@ -82,7 +82,7 @@ pub(super) async fn run(args: &Args, nodes: Vec<String>, session: &mut Session) 
     if items.is_empty() && nodes.is_empty() && args.output == Format::Table {
         session.ui.note("no robot's place is known");
     }
-    let mut printer = Printer { args, widths: Vec::new(), head: !args.no_headers };
+    let mut printer = Printer { args, rows: Rows::new(!args.no_headers) };
     match args.output {
         Format::Yaml | Format::Json => {
             let list = json!({ "apiVersion": muster_api::API_VERSION, "kind": "PoseList", "items": items });
@@ -102,7 +102,7 @@ async fn watch(args: &Args, nodes: &[String], session: &mut Session) -> Outcome 
         pairs.push(("nodes", &names));
     }
     let path = with_query(&group_path("poses"), &pairs);
-    let mut printer = Printer { args, widths: Vec::new(), head: !args.no_headers };
+    let mut printer = Printer { args, rows: Rows::new(!args.no_headers) };
     loop {
         let mut stream = session.client.stream(&path).await?;
         let mut first = Some(Vec::new());
@@ -133,8 +133,7 @@ fn unread(session: &Session, source: serde_json::Error) -> CliError {
 
 struct Printer<'a> {
     args: &'a Args,
-    widths: Vec<u16>,
-    head: bool,
+    rows: Rows,
 }
 
 impl Printer<'_> {
@@ -143,32 +142,22 @@ impl Printer<'_> {
             return Ok(());
         }
         match self.args.output {
-            Format::Table | Format::Wide => self.rows(items, session),
+            Format::Table | Format::Wide => self.print_rows(items, session),
             Format::Name => items.iter().try_for_each(|item| {
                 session.ui.line(&format!("pose/{}", item["node"].as_str().unwrap_or_default()))
             }),
-            Format::Json => items.iter().try_for_each(|item| session.ui.line(&item.to_string())),
-            Format::Yaml => items.iter().try_for_each(|item| {
-                let text = document(item, Format::Yaml)?;
-                session.ui.print(&format!("---\n{text}"))
-            }),
+            Format::Json | Format::Yaml => print_each(items, self.args.output, session),
         }
     }
 
-    fn rows(&mut self, items: &[Value], session: &mut Session) -> Result<(), CliError> {
+    fn print_rows(&mut self, items: &[Value], session: &mut Session) -> Result<(), CliError> {
         let mut table = Table::new(HEAD);
         for item in items {
             let item: Item =
                 serde_json::from_value(item.clone()).map_err(|source| unread(session, source))?;
             table.push(row(item));
         }
-        if !std::mem::take(&mut self.head) {
-            table = table.without_head();
-        }
-        table.at_least(&self.widths);
-        let (text, widths) = table.render(&session.ui.styles);
-        self.widths = widths;
-        session.ui.print(&text)
+        self.rows.print(table, session)
     }
 }
 

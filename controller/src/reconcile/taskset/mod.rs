@@ -24,7 +24,7 @@ use muster_api::kind::taskset_revision::TaskSetRevision;
 use muster_controller_core::taskset::view::{RevisionView, TaskView};
 use muster_controller_core::taskset::{Snapshot, plan};
 
-use super::{RETRY, next_events, watch_from_now};
+use super::{again, next_events, watch_from_now};
 use crate::context::Context;
 use crate::objects::{self, REVISIONS};
 use crate::store::{Change, Key, StoreError, Stored};
@@ -36,12 +36,7 @@ const LATER: Duration = Duration::from_secs(5);
 
 /// Works until dropped.
 pub async fn run(context: Arc<Context>) {
-    loop {
-        if let Err(error) = follow(&context).await {
-            tracing::warn!(error = crate::app::chain(&error), "task sets are not looked after");
-            tokio::time::sleep(RETRY).await;
-        }
-    }
+    again(&context, "task sets are not looked after", follow).await;
 }
 
 /// Looks at every set, then at those that something changed for; ends when it must begin anew.
