@@ -11,8 +11,9 @@
 //! | [`reconcile`] | level-triggered loops: scheduling, health, deletion, garbage |
 //! | [`pki`], [`auth`] | certificates; who asks and whether they may |
 //! | [`events`], [`objects`] | Event objects; typed reading and writing of the kinds |
+//! | `quota` | the door of namespaces with a Quota |
 //! | `serve` | the TLS port |
-//! | `kubeconfig`, `metrics` | the admin's credential file; the Prometheus recorder |
+//! | `kubeconfig`, `metrics`, `memory` | the admin's credential file; the Prometheus recorder; what the allocator keeps |
 
 pub mod app;
 pub mod auth;
@@ -20,9 +21,11 @@ pub mod config;
 pub mod context;
 pub mod events;
 pub mod kubeconfig;
+mod memory;
 mod metrics;
 pub mod objects;
 pub mod pki;
+mod quota;
 pub mod reconcile;
 pub mod rest;
 mod serve;

@@ -17,7 +17,8 @@
 //! | [`schedule`] | where a task goes, or why it goes nowhere (invariant 6) |
 //! | [`preempt`] | who is ended to make room for whom |
 //! | [`offer`] | which frameworks are shown what, and whose Accept passes |
-//! | [`fairness`] | namespaces' shares and quotas |
+//! | [`fairness`] | namespaces' shares, and what their quotas leave of what can be reserved |
+//! | [`quota`] | whether a namespace's quota lets a new task in |
 //! | [`recent`] | one allocation for what many nodes or tasks have in common |
 //! | [`node_health`] | when a node counts as lost |
 //! | [`taskset`] | which tasks of a TaskSet begin, end and follow each other |
@@ -34,6 +35,7 @@ pub mod node_health;
 pub mod offer;
 pub mod poses;
 pub mod preempt;
+pub mod quota;
 pub mod recent;
 pub mod report;
 pub mod schedule;

@@ -7,6 +7,7 @@ mod fencing;
 mod fleet;
 mod objects;
 mod poses;
+mod quotas;
 mod removal;
 mod support;
 mod watching;
