@@ -115,6 +115,7 @@ impl AgentError {
 
 /// Runs an agent until a signal ends it. Tasks stay.
 pub fn run(args: Args, reexec: Reexec) -> ExitCode {
+    footprint::keep_buffers();
     let done = tokio::runtime::Builder::new_current_thread()
         .enable_all()
         // For short file work only; each thread costs memory on a robot.
