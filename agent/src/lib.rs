@@ -15,6 +15,7 @@
 //! | `checkpoint`, `durable` | what survives the agent |
 //! | `board` | what tasks show of themselves |
 //! | `executor` | tasks that run other tasks, over a socket of their own |
+//! | `gauge` | what is read off the machine: battery, disk, labels |
 //! | `footprint` | memory that is given back after the start |
 //! | `contact` | when the controller was last heard, for the shims too |
 //! | `link` | joining, the session, logs on request |
@@ -33,6 +34,7 @@ mod driver;
 mod durable;
 mod executor;
 mod footprint;
+mod gauge;
 mod link;
 mod node;
 mod position;

@@ -23,6 +23,7 @@
 //! | [`node_health`] | when a node counts as lost |
 //! | [`taskset`] | which tasks of a TaskSet begin, end and follow each other |
 //! | [`stray`] | what an agent runs and should not |
+//! | [`upkeep`] | when a node is out of service for its battery or for people's work |
 //! | [`report`] | typed reasons, with the words people read |
 #![deny(missing_docs)]
 
@@ -42,3 +43,4 @@ pub mod schedule;
 pub mod space;
 pub mod stray;
 pub mod taskset;
+pub mod upkeep;

@@ -13,6 +13,7 @@
 //! | [`quotas`] | the scheduler's ledger | writes what namespaces have into Quota status |
 //! | [`health`] | heartbeats | marks silent nodes and their tasks |
 //! | [`taskset`] | TaskSets, their tasks, nodes | begins and ends tasks, changes them, goes back |
+//! | [`upkeep`] | Nodes with batteries and maintenance windows | says when nothing new begins there, ends what is to be gone |
 //! | [`deletion`] | Tasks being deleted | removes those whose processes are gone |
 //! | [`garbage`] | ownerReferences | deletes what lost its owner |
 //! | [`history`] | Events, the store's history | forgets what is old |
@@ -32,6 +33,7 @@ mod preempt;
 pub mod quotas;
 pub mod schedule;
 pub mod taskset;
+pub mod upkeep;
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -85,6 +87,7 @@ pub fn spawn(
     run("deletion", Box::pin(deletion::run(Arc::clone(context))));
     run("garbage", Box::pin(garbage::run(Arc::clone(context))));
     run("taskset", Box::pin(taskset::run(Arc::clone(context))));
+    run("upkeep", Box::pin(upkeep::run(Arc::clone(context))));
     run("history", Box::pin(history::run(Arc::clone(context))));
     run("board", Box::pin(crate::session::board::run(Arc::clone(context), Arc::clone(sessions))));
     run("poses", Box::pin(poses::run(Arc::clone(context), Arc::clone(poses))));

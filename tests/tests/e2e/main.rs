@@ -12,3 +12,4 @@ mod preemption;
 mod quotas;
 mod survival;
 mod tasksets;
+mod upkeep;

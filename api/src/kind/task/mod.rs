@@ -126,6 +126,14 @@ pub struct Placement {
     pub tolerations: Vec<Toleration>,
     /// How robots are scored; the lowest score wins.
     pub cost: Cost,
+    /// The least charge of a robot's battery, percent; a node without a battery has enough. Beside it, a robot whose
+    /// battery is below its own `spec.minBattery` takes only tasks that tolerate `muster.dev/battery-low`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub min_battery: Option<u8>,
+    /// What each percent that a robot's battery lacks of a full one adds to its score, metres or seconds as `cost` has
+    /// it: of two robots the fuller one, unless it is that much farther away. None: only of equally good ones.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub battery_cost: Option<f64>,
 }
 
 /// Which kind of node a task may run on.
@@ -526,6 +534,8 @@ pub struct StopOrder {
 pub const PREEMPTING: &str = "Preempting";
 /// Reason of a task that was ended to make room for one of more priority.
 pub const PREEMPTED: &str = "Preempted";
+/// Reason of a task whose node is in a maintenance window that drains it.
+pub const NODE_MAINTENANCE: &str = "NodeMaintenance";
 /// Reason of a task whose `activeDeadlineSeconds` have passed.
 pub const DEADLINE_EXCEEDED: &str = "DeadlineExceeded";
 

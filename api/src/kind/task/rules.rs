@@ -43,6 +43,22 @@ pub(in crate::kind) fn rules(spec: &TaskSpec, violations: &mut Violations) {
 
 fn placement_rules(spec: &TaskSpec, violations: &mut Violations) {
     let placement = &spec.placement;
+    if let Some(percent) = placement.min_battery.filter(|percent| *percent > 100) {
+        violations
+            .invalid("spec.placement.minBattery", format!("{percent} is more than a full battery"))
+            .suggest("percent, 0 to 100");
+    }
+    if let Some(cost) = placement.battery_cost {
+        if !(cost >= 0.0 && cost.is_finite()) {
+            violations
+                .invalid("spec.placement.batteryCost", format!("{cost} adds nothing to a score"))
+                .suggest("metres or seconds for each percent, 0 or more; try 0.1");
+        } else if placement.at.is_none() {
+            violations
+                .invalid("spec.placement.batteryCost", "there is no score to add to")
+                .suggest("`batteryCost` needs an operation position: at: {x: 3.0, y: 4.0}");
+        }
+    }
     if let Some(within) = placement.within {
         if !(within >= 0.0 && within.is_finite()) {
             violations
