@@ -13,7 +13,7 @@ use futures::{StreamExt as _, TryStreamExt as _};
 use muster_api::duration::Span;
 use serde_json::{Map, Value, json};
 
-use super::{FirstError, Outcome, settle};
+use super::{FirstError, Outcome, plan, settle};
 use crate::args::span;
 use crate::client::{Client, Mode};
 use crate::error::CliError;
@@ -35,6 +35,9 @@ pub(crate) struct Args {
     /// Let the controller check everything, and store nothing
     #[arg(long)]
     dry_run: bool,
+    /// Do what `muster plan` said under this index, or nothing when it would now be something else
+    #[arg(long, value_name = "INDEX")]
+    check_index: Option<String>,
     /// Wait until every task runs, has ended, or says why it waits
     #[arg(long, conflicts_with = "dry_run")]
     wait: bool,
@@ -70,8 +73,11 @@ pub(crate) async fn run(args: Args, session: &mut Session) -> Outcome {
     let client = &session.client;
     let steps = look_at_all(client, manifests).await?;
     // One object is checked and stored by one request anyway.
-    if args.dry_run || steps.len() > 1 {
+    if args.dry_run || steps.len() > 1 || args.check_index.is_some() {
         rehearse(client, &steps).await?;
+    }
+    if let Some(index) = &args.check_index {
+        plan::check(session, &steps, index).await?;
     }
     let mode = if args.dry_run { Mode::DryRun } else { Mode::Store };
     let (applied, failed) = store(session, steps, mode, args.output).await?;
