@@ -5,6 +5,7 @@ pub mod agent_session;
 mod error;
 pub mod framework_session;
 pub mod pose_stream;
+mod secret;
 
 pub use error::WireError;
 

@@ -18,6 +18,8 @@
 //! | [`preempt`] | who is ended to make room for whom |
 //! | [`offer`] | which frameworks are shown what, and whose Accept passes |
 //! | [`fairness`] | namespaces' shares and quotas |
+//! | [`hold`] | why a task is not considered for a place at all |
+//! | [`config`] | what a task gets of ConfigMaps and Secrets |
 //! | [`recent`] | one allocation for what many nodes or tasks have in common |
 //! | [`node_health`] | when a node counts as lost |
 //! | [`taskset`] | which tasks of a TaskSet begin, end and follow each other |
@@ -26,9 +28,11 @@
 #![deny(missing_docs)]
 
 pub mod cluster;
+pub mod config;
 pub mod fairness;
 #[cfg(test)]
 mod fixtures;
+pub mod hold;
 pub mod ledger;
 pub mod node_health;
 pub mod offer;
