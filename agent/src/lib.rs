@@ -14,6 +14,7 @@
 //! | `supervisor`, `driver` | what `muster-agent-core` decides, carried out |
 //! | `checkpoint`, `durable` | what survives the agent |
 //! | `board` | what tasks show of themselves |
+//! | `given` | what tasks are given of ConfigMaps and Secrets |
 //! | `executor` | tasks that run other tasks, over a socket of their own |
 //! | `footprint` | memory that is given back after the start |
 //! | `contact` | when the controller was last heard, for the shims too |
@@ -33,6 +34,7 @@ mod driver;
 mod durable;
 mod executor;
 mod footprint;
+mod given;
 mod link;
 mod node;
 mod position;
