@@ -163,7 +163,12 @@ pub(crate) async fn drive(
     inbox: mpsc::UnboundedReceiver<Message>,
 ) {
     let context = context(&shared);
-    let unkept = !matches!(begin, Begin::Restored(..));
+    let unkept = match &begin {
+        Begin::New(_, assignment, _) | Begin::Unreadable(_, assignment, _) => {
+            assignment.given.is_some()
+        }
+        Begin::Restored(..) => false,
+    };
     let (record, response) = match begin {
         Begin::New(uid, assignment, desired) => {
             let fetch = spec::fetch(&assignment.spec);

@@ -118,7 +118,7 @@ async fn migrate(connection: &mut SqliteConnection, path: &Path) -> Result<(), O
 }
 
 async fn has_sealed(connection: &mut SqliteConnection) -> Result<bool, sqlx::Error> {
-    let row = sqlx::query("SELECT EXISTS (SELECT 1 FROM kv WHERE value LIKE 'sealed:%')");
+    let row = sqlx::query("SELECT EXISTS (SELECT 1 FROM kv WHERE resource = 'secrets')");
     row.fetch_one(connection).await?.try_get(0)
 }
 
