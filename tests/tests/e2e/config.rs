@@ -36,8 +36,9 @@ async fn patch(cluster: &Cluster, path: &str, patch: &Value) {
     let _: Value = cluster.client().await.request(request).await.expect("it is patched");
 }
 
-/// Waits until a task has written `wanted`.
+/// Waits until a task runs and has written `wanted`.
 async fn says(cluster: &Cluster, task: &str, wanted: &str) {
+    cluster.phase(task, TaskPhase::Running).await;
     wait::until(&format!("{task} says {wanted:?}"), || async {
         let log = cluster.task_log(task).await;
         if log.contains(wanted) { Ok(()) } else { Err(log) }
@@ -260,7 +261,7 @@ async fn a_container_sees_files_at_their_places_and_has_its_variables() {
     config_map(&cluster, "settings", json!({"A": "1"})).await;
     secret(&cluster, "login", json!({"password": PASSWORD})).await;
     let script = "echo A=$A P=$P; cat /etc/app/A; echo; cat /keys/a/pw; echo; \
-                  echo x > /etc/app/B || echo read only; exec sleep 1000";
+                  (echo x > /etc/app/B) 2>/dev/null || echo read only; exec sleep 1000";
     let run = json!({
         "image": docker::IMAGE, "command": ["sh", "-c", script], "network": "None", "pullPolicy": "Never",
         "env": [{"name": "P", "valueFrom": {"secretKeyRef": {"name": "login", "key": "password"}}}],
