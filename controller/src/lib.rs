@@ -4,6 +4,7 @@
 //! |---|---|
 //! | [`app`] | starts, joins and ends everything |
 //! | [`config`] | flags and their defaults |
+//! | [`configs`] | ConfigMaps and Secrets, from the store to tasks |
 //! | [`context`] | what the parts share |
 //! | [`store`] | revisioned objects, durable writes, watches |
 //! | [`rest`] | Kubernetes API conventions over the store |
@@ -18,6 +19,7 @@
 pub mod app;
 pub mod auth;
 pub mod config;
+pub mod configs;
 pub mod context;
 pub mod events;
 pub mod kubeconfig;

@@ -3,6 +3,7 @@
 //! Order in the child: enter the group (while it still has the rights to), new session, user,
 //! directory, exec. The program is in its group before its first instruction.
 
+use std::collections::BTreeMap;
 use std::ffi::CString;
 use std::fmt;
 use std::io;
@@ -64,7 +65,10 @@ struct Identity {
     home: Option<String>,
 }
 
-pub(super) fn start(order: &Order) -> Result<Started, StartError> {
+pub(super) fn start(
+    order: &Order,
+    given: &BTreeMap<String, String>,
+) -> Result<Started, StartError> {
     let Program::Process { argv, working_dir, user } = &order.launch.program else {
         return Err(StartError::Order("the order is for a container".to_owned()));
     };
@@ -96,6 +100,7 @@ pub(super) fn start(order: &Order) -> Result<Started, StartError> {
         command.env("HOME", home);
     }
     command.envs(&order.launch.env);
+    command.envs(given);
     if let Some((name, value)) = mark(&order.launch.id).split_once('=') {
         command.env(name, value);
     }

@@ -6,6 +6,7 @@ mod error;
 pub mod framework_session;
 pub mod pose_stream;
 mod rope;
+mod secret;
 
 pub use error::WireError;
 pub use rope::Rope;

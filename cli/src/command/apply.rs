@@ -118,6 +118,11 @@ fn decide(manifest: &Manifest, current: Option<Value>) -> Action {
             metadata.remove("annotations");
         }
     }
+    let secret = manifest.info.kind == "Secret";
+    if secret {
+        // Which keys it had is all that the next apply needs to know.
+        hide_values(&mut last["data"]);
+    }
     let annotation = Value::from(last.to_string());
     let Some(current) = current else {
         let mut object = manifest.written.clone();
@@ -137,7 +142,26 @@ fn decide(manifest: &Manifest, current: Option<Value>) -> Action {
     let patch = three_way(before.as_ref(), &wanted, &current);
     match patch.as_object().is_none_or(Map::is_empty) {
         true => Action::Nothing(current),
-        false => Action::Patch { fields: field_changes(&patch, &current), patch },
+        false => {
+            let mut fields = field_changes(&patch, &current);
+            if secret {
+                fields.iter_mut().filter(|f| f.path.starts_with("data")).for_each(hide_change);
+            }
+            Action::Patch { fields, patch }
+        }
+    }
+}
+
+fn hide_values(data: &mut Value) {
+    if let Some(values) = data.as_object_mut() {
+        values.values_mut().for_each(|value| *value = Value::from(""));
+    }
+}
+
+/// That something of a Secret changed is shown, and not to what.
+fn hide_change(change: &mut FieldChange) {
+    for side in [&mut change.from, &mut change.to] {
+        *side = side.take().map(|_| Value::from("(hidden)"));
     }
 }
 
@@ -219,7 +243,7 @@ pub(super) async fn rehearse(client: &Client, steps: &[Step]) -> Result<(), CliE
 fn rank(step: &Step) -> (u8, Reverse<i64>) {
     let first = match step.manifest.info.kind {
         "Namespace" => 0,
-        "Node" => 1,
+        "Node" | "ConfigMap" | "Secret" => 1,
         _ => 2,
     };
     let priority = step.manifest.admitted.pointer("/spec/priority").and_then(Value::as_i64);

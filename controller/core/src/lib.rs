@@ -19,6 +19,8 @@
 //! | [`offer`] | which frameworks are shown what, and whose Accept passes |
 //! | [`fairness`] | namespaces' shares, and what their quotas leave of what can be reserved |
 //! | [`quota`] | whether a namespace's quota lets a new task in |
+//! | [`hold`] | why a task is not considered for a place at all |
+//! | [`config`] | what a task gets of ConfigMaps and Secrets |
 //! | [`recent`] | one allocation for what many nodes or tasks have in common |
 //! | [`node_health`] | when a node counts as lost |
 //! | [`taskset`] | which tasks of a TaskSet begin, end and follow each other |
@@ -28,9 +30,11 @@
 #![deny(missing_docs)]
 
 pub mod cluster;
+pub mod config;
 pub mod fairness;
 #[cfg(test)]
 mod fixtures;
+pub mod hold;
 pub mod ledger;
 pub mod node_health;
 pub mod offer;

@@ -3,7 +3,7 @@
 //!
 //! | loop | looks at | does |
 //! |---|---|---|
-//! | [`schedule`] | Nodes, Tasks, Leases | binds Pending tasks, orders ends to make room, or writes why not |
+//! | [`schedule`] | Nodes, Tasks, Leases, ConfigMaps, Secrets | binds Pending tasks, orders ends to make room, or writes why not |
 //! | [`deadline`] | Tasks with deadlines | orders the end of those that have run long enough, removes those that ended long ago |
 //! | [`desk`] | frameworks, in [`schedule`]'s own task | shows offers, takes Accepts |
 //! | [`failover`] | Frameworks | removes those that stay away, writes their numbers |

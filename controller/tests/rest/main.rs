@@ -3,6 +3,7 @@
 
 mod access;
 mod agent;
+mod config;
 mod fencing;
 mod fleet;
 mod objects;

@@ -1,6 +1,7 @@
 //! The main job with real processes, cgroups, SQLite and Docker.
 
 mod cli;
+mod config;
 mod demo;
 mod examples;
 mod fence;

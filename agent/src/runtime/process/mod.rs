@@ -48,6 +48,7 @@ use super::launch::{AttemptId, Launch, Limits, Used};
 use super::{Launched, LogQuery, Runtime, RuntimeError, RuntimeStatus, logs};
 use crate::clock;
 use crate::durable::FileError;
+use crate::given::files::Place;
 use attempt::{AttemptDir, LogBounds, Process, StopFile};
 use reach::{Ladder, Reach};
 
@@ -79,6 +80,7 @@ impl Reexec {
 pub(crate) struct ProcessConfig {
     /// Holds `<uid>/attempts/<n>` and `<uid>/work`.
     pub(crate) tasks: PathBuf,
+    pub(crate) files: Place,
     pub(crate) reexec: Reexec,
     pub(crate) contact: PathBuf,
     pub(crate) log: LogBounds,

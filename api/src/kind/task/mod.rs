@@ -1,5 +1,6 @@
 //! Task: one run of one program on one node, the unit that is placed.
 
+pub mod config;
 pub(super) mod rules;
 #[cfg(test)]
 mod tests;
@@ -10,6 +11,8 @@ use k8s_openapi::apimachinery::pkg::apis::meta::v1::MicroTime;
 use kube::CustomResource;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
+
+pub use config::{EnvFrom, EnvSource, Files};
 
 use super::node::{NodeKind, Taint, TaintEffect};
 use super::{KindInfo, admit_spec};
@@ -315,6 +318,12 @@ pub struct ContainerRun {
     /// Environment.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub env: Vec<EnvVar>,
+    /// Whole ConfigMaps and Secrets as environment.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub env_from: Vec<EnvFrom>,
+    /// ConfigMaps and Secrets as files.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub files: Vec<Files>,
     /// Working directory in the container.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub working_dir: Option<String>,
@@ -342,6 +351,12 @@ pub struct ProcessRun {
     /// Environment, beside the agent's PATH and the MUSTER_ variables.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub env: Vec<EnvVar>,
+    /// Whole ConfigMaps and Secrets as environment.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub env_from: Vec<EnvFrom>,
+    /// ConfigMaps and Secrets as files.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub files: Vec<Files>,
     /// Working directory; none: a directory of the task's own.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub working_dir: Option<String>,
@@ -359,6 +374,9 @@ pub struct EnvVar {
     /// Value.
     #[serde(default)]
     pub value: String,
+    /// Where the value comes from instead.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub value_from: Option<EnvSource>,
 }
 
 /// A directory or file of the node that a container sees.

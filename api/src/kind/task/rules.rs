@@ -187,6 +187,7 @@ fn run_rules(run: &Run, violations: &mut Violations) {
             violations.required("spec.run.container.image");
         }
         env_rules(&container.env, "spec.run.container.env", violations);
+        super::config::rules(run, "spec.run.container", violations);
         absolute("spec.run.container.workingDir", container.working_dir.as_deref(), violations);
         for (i, mount) in container.mounts.iter().enumerate() {
             let path = element_path("spec.run.container.mounts", i);
@@ -201,6 +202,7 @@ fn run_rules(run: &Run, violations: &mut Violations) {
                 .suggest("for example [\"/usr/bin/env\"]");
         }
         env_rules(&process.env, "spec.run.process.env", violations);
+        super::config::rules(run, "spec.run.process", violations);
         absolute("spec.run.process.workingDir", process.working_dir.as_deref(), violations);
     }
     if let Some(executor) = &run.executor

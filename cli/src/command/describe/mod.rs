@@ -3,6 +3,7 @@
 
 mod any;
 mod framework;
+mod keyed;
 mod lease;
 mod node;
 mod quota;
@@ -109,6 +110,12 @@ async fn describe(
             taskset::describe(&mut sheet, &set, &tasks, now);
         }
         "Task" => task::describe(&mut sheet, &serde_json::from_value(object).map_err(read)?, now),
+        "ConfigMap" => {
+            keyed::config_map(&mut sheet, &serde_json::from_value(object).map_err(read)?, now);
+        }
+        "Secret" => {
+            keyed::secret(&mut sheet, &serde_json::from_value(object).map_err(read)?, now);
+        }
         "Lease" => lease::describe(&mut sheet, &serde_json::from_value(object).map_err(read)?, now),
         _ => any::describe(&mut sheet, &object, now),
     }

@@ -5,10 +5,12 @@ use muster_api::kind::framework::{ACKNOWLEDGE_FINALIZER, FRAMEWORK_LABEL};
 use muster_api::kind::task::Task;
 use muster_api::wire::framework::v1 as wire;
 use muster_api::wire::framework_session::json_of;
+use muster_controller_core::hold::Hold;
 use muster_controller_core::offer::OfferId;
 use serde_json::{Value, json};
 
 use super::{convert, subscribe};
+use crate::configs;
 use crate::context::Context;
 use crate::objects::TASKS;
 use crate::quota::Pass;
@@ -115,6 +117,15 @@ fn task_of(
     let object = create::prepare_object(context, TASKS, object).map_err(refused)?;
     let task: Task =
         serde_json::from_value(object.clone()).map_err(|error| wrong("spec", error.to_string()))?;
+    let holds =
+        configs::holds(&context.store, framework.namespace().unwrap_or_default(), &task.spec);
+    if !holds.is_empty() {
+        let cause = |hold: &Hold| wire::Cause {
+            field: "spec.run".to_owned(),
+            message: format!("{}: {hold}", hold.reason()),
+        };
+        return Err(holds.iter().map(cause).collect());
+    }
     if task.spec.placement.node.is_some() {
         return Err(wrong(
             "spec.placement.node",
