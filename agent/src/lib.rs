@@ -36,6 +36,7 @@ mod footprint;
 mod link;
 mod node;
 mod position;
+mod probe;
 mod runtime;
 pub mod shim;
 mod spec;

@@ -17,7 +17,7 @@
 
 mod guard;
 mod output;
-mod start;
+pub(crate) mod start;
 mod watch;
 
 use std::ffi::OsString;
