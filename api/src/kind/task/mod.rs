@@ -476,6 +476,9 @@ pub struct TaskStatus {
     /// Whether its start-up and readiness probes say that it can serve, true only while it runs; none: it has neither.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub ready: Option<bool>,
+    /// Since when `ready` is true, by the controller's clock.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub ready_at: Option<MicroTime>,
     /// Number of the current attempt; 1 is the first, 0: none yet.
     pub attempt: u32,
     /// How the last attempt that ended ended.
@@ -521,6 +524,15 @@ impl TaskStatus {
     #[must_use]
     pub fn is_ready(&self) -> bool {
         self.phase == TaskPhase::Running && self.ready != Some(false)
+    }
+
+    /// Takes what its node says of its probes, in the phase that it has now.
+    pub fn set_ready(&mut self, ready: Option<bool>, now: MicroTime) {
+        self.ready = ready.map(|ready| ready && self.phase == TaskPhase::Running);
+        match self.ready {
+            Some(true) => drop(self.ready_at.get_or_insert(now)),
+            Some(false) | None => self.ready_at = None,
+        }
     }
 }
 

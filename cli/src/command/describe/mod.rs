@@ -5,6 +5,7 @@ mod any;
 mod framework;
 mod lease;
 mod node;
+mod probes;
 mod quota;
 mod task;
 mod taskset;

@@ -143,11 +143,15 @@ fn a_probe_that_never_says_ready_ends_the_rollout_at_the_deadline() {
     world.set_template(1);
     world.steps(4);
     world.task("set-0").ready = Some(false);
+    "its readiness probe failed: HTTP status 503".clone_into(&mut world.task("set-0").message);
     world.steps(4);
     assert_eq!(world.templates(), ["1", "0", "0"], "it has time");
     world.settle();
     assert_eq!(world.templates(), ["0", "0", "0"]);
-    assert_eq!(world.status.rolled_back_from.as_ref().expect("given up").reason, "ProbeFailed");
+    let why = world.status.rolled_back_from.as_ref().expect("given up");
+    assert_eq!(why.reason, "ProbeFailed");
+    let said = "was not ready within 30 s: its readiness probe failed: HTTP status 503";
+    assert!(why.message.ends_with(said), "{}", why.message);
 }
 
 #[test]
