@@ -1,6 +1,7 @@
 //! A program inside a running container, and the container's network: for its checks.
 
 use std::fs::File;
+use std::time::Duration;
 
 use bollard::Docker;
 use bollard::exec::{StartExecOptions, StartExecResults};
@@ -10,8 +11,6 @@ use futures::future::BoxFuture;
 use rustix::process::{Pid, Signal};
 
 use super::inspect::{self, Seen};
-use crate::runtime::process::attempt::Process;
-use crate::runtime::process::scan;
 use crate::runtime::{Executed, KEPT_WORDS, Reached, RuntimeError};
 
 /// What a shell, and the engine, return for a program that cannot be executed, and for one that is not there.
@@ -21,28 +20,30 @@ fn failed<E: std::error::Error + Send + Sync + 'static>(error: E) -> RuntimeErro
     RuntimeError::new("run a program in a container", error)
 }
 
-/// The engine ends no program that it runs in a container: its processes are found on this node, and killed here.
-struct Whole(Option<Process>);
+/// How long the engine may take to say which process a program is that is to be killed.
+const KILLED_WITHIN: Duration = Duration::from_secs(2);
 
-impl Whole {
-    /// The group of the program: the engine makes it the leader of its session.
-    fn of(pid: Option<i64>) -> Whole {
-        Whole(
-            pid.and_then(|pid| i32::try_from(pid).ok())
-                .filter(|pid| *pid > 0)
-                .and_then(scan::process),
-        )
-    }
-}
-
-impl Drop for Whole {
-    fn drop(&mut self) {
-        if let Some(process) = self.0.filter(|process| scan::is_alive(*process))
-            && let Some(pid) = Pid::from_raw(process.pid)
-        {
-            // Gone already: nothing to kill.
-            let _ = rustix::process::kill_process_group(pid, Signal::KILL);
+/// Kills a program with its process group. The engine has no word for that: it says which process of this node it is,
+/// as soon as it has started it, and made it the leader of its session.
+async fn kill(docker: &Docker, id: &str) {
+    let killed = async {
+        loop {
+            let Ok(seen) = docker.inspect_exec(id).await else { return };
+            // Over: its number may be another process's by now.
+            if seen.running == Some(false) && seen.exit_code.is_some() {
+                return;
+            }
+            let pid = seen.pid.and_then(|pid| i32::try_from(pid).ok()).and_then(Pid::from_raw);
+            if let Some(pid) = pid {
+                // An error says that it is gone.
+                let _ = rustix::process::kill_process_group(pid, Signal::KILL);
+                return;
+            }
+            tokio::time::sleep(Duration::from_millis(20)).await;
         }
+    };
+    if tokio::time::timeout(KILLED_WITHIN, killed).await.is_err() {
+        tracing::warn!(exec = id, "a check in a container may live on until its container ends");
     }
 }
 
@@ -60,13 +61,17 @@ pub(super) async fn exec(
     };
     let id = docker.create_exec(container, config).await.map_err(failed)?.id;
     let mut said = Vec::new();
-    // Cancel-safe: dropped whole, and what runs is killed by `Whole`.
-    tokio::select! {
-        over = listen(docker, &id, &mut said) => match over? {
-            Some(words) => return Ok(Executed::NotStarted(words)),
-            None => {}
-        },
-        () = until => return Ok(Executed::Cut { said: text(&said) }),
+    let over = tokio::select! {
+        over = listen(docker, &id, &mut said) => Some(over?),
+        () = until => None,
+    };
+    match over {
+        Some(None) => {}
+        Some(Some(words)) => return Ok(Executed::NotStarted(words)),
+        None => {
+            kill(docker, &id).await;
+            return Ok(Executed::Cut { said: text(&said) });
+        }
     }
     let code = docker.inspect_exec(&id).await.map_err(failed)?.exit_code.unwrap_or(-1);
     let said = text(&said);
@@ -98,7 +103,6 @@ async fn listen(
             };
         }
     };
-    let _whole = Whole::of(docker.inspect_exec(id).await.map_err(failed)?.pid);
     while let Some(part) = output.next().await {
         let part = part.map_err(failed)?.into_bytes();
         let room = KEPT_WORDS.saturating_sub(said.len());
