@@ -19,6 +19,7 @@
 //! | `contact` | when the controller was last heard, for the shims too |
 //! | `link` | joining, the session, logs on request |
 //! | `node`, `capacity`, `position` | what this node is, has, and where it is |
+//! | `probe` | checks of running tasks |
 //! | `runtime`, `shim` | what runs tasks |
 
 mod app;

@@ -5,7 +5,7 @@
 mod common;
 
 use std::io::{Read, Write};
-use std::net::{TcpListener, TcpStream};
+use std::net::TcpListener;
 use std::path::Path;
 use std::sync::atomic::{AtomicU16, Ordering};
 use std::sync::{Arc, Mutex};
@@ -14,6 +14,8 @@ use common::agent::Agent;
 use common::controller::Controller;
 use common::{lives, until};
 use muster_api::wire::agent::v1 as proto;
+use rustls::pki_types::PrivateKeyDer;
+use rustls::pki_types::pem::PemObject;
 use serde_json::{Value, json};
 
 /// A task that lives until it is told to end, and ends well then.
@@ -57,13 +59,42 @@ struct Server {
 
 impl Server {
     fn start() -> Server {
+        Self::start_with(None)
+    }
+
+    /// With a certificate that nobody has signed.
+    fn start_tls() -> Server {
+        let key = rcgen::KeyPair::generate().unwrap();
+        let params = rcgen::CertificateParams::new(vec!["robot".to_owned()]).unwrap();
+        let certificate = params.self_signed(&key).unwrap();
+        let provider = Arc::new(rustls::crypto::ring::default_provider());
+        let config = rustls::ServerConfig::builder_with_provider(provider)
+            .with_safe_default_protocol_versions()
+            .unwrap()
+            .with_no_client_auth()
+            .with_single_cert(
+                vec![certificate.der().clone()],
+                PrivateKeyDer::from_pem_slice(key.serialize_pem().as_bytes()).unwrap(),
+            )
+            .unwrap();
+        Self::start_with(Some(Arc::new(config)))
+    }
+
+    fn start_with(tls: Option<Arc<rustls::ServerConfig>>) -> Server {
         let listener = TcpListener::bind("127.0.0.1:0").unwrap();
         let port = listener.local_addr().unwrap().port();
         let (status, heard) = (Arc::new(AtomicU16::new(503)), Arc::new(Mutex::default()));
         let server = Server { port, status: Arc::clone(&status), heard: Arc::clone(&heard) };
         std::thread::spawn(move || {
             for stream in listener.incoming() {
-                answer(&mut stream.unwrap(), status.load(Ordering::SeqCst), &heard);
+                let (mut stream, status) = (stream.unwrap(), status.load(Ordering::SeqCst));
+                match &tls {
+                    None => answer(&mut stream, status, &heard),
+                    Some(config) => {
+                        let session = rustls::ServerConnection::new(Arc::clone(config)).unwrap();
+                        answer(&mut rustls::StreamOwned::new(session, stream), status, &heard);
+                    }
+                }
             }
         });
         server
@@ -74,7 +105,7 @@ impl Server {
     }
 }
 
-fn answer(stream: &mut TcpStream, status: u16, heard: &Mutex<String>) {
+fn answer(stream: &mut (impl Read + Write), status: u16, heard: &Mutex<String>) {
     let mut request = Vec::new();
     let mut buffer = [0; 1024];
     while !request.windows(4).any(|end| end == b"\r\n\r\n") {
@@ -172,6 +203,22 @@ fn http_and_tcp_are_asked() {
     assert_eq!(end.exit_code, Some(0), "its program obeyed, and has failed all the same");
     controller.stop("web", 0);
     controller.wait_end("web");
+}
+
+#[test]
+fn https_is_asked_whoever_answers() {
+    let controller = Controller::start();
+    let _agent = Agent::start(&controller);
+    let server = Server::start_tls();
+    let mut spec = obedient();
+    spec["readiness"] = json!({ "http": { "port": server.port, "scheme": "HTTPS" }, "period": "100ms",
+        "timeout": "10s", "failureThreshold": 1 });
+    controller.assign("tls", spec);
+    wait_said(&controller, "tls", "HTTP status 503: the map is loading");
+    server.say(200);
+    wait_ready(&controller, "tls", true);
+    controller.stop("tls", 0);
+    controller.wait_end("tls");
 }
 
 #[test]

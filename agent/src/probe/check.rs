@@ -7,9 +7,9 @@ use std::time::Duration;
 use futures::FutureExt;
 use muster_agent_core::probe::{Answer, shorten};
 use muster_api::duration::Span;
-use muster_api::kind::task::probe::{HttpCheck, Probe, address};
+use muster_api::kind::task::probe::{HttpCheck, Probe, Scheme, address};
 
-use super::{connect, http};
+use super::{connect, http, tls};
 use crate::driver::chain;
 use crate::runtime::{Executed, Launch, Runtime, RuntimeError};
 
@@ -124,7 +124,17 @@ async fn over_http(
         Ok(stream) => stream,
         Err(error) => return refused(error, at),
     };
-    match http::get(stream, at, check).await {
+    let got = match check.scheme {
+        Scheme::Http => http::get(stream, at, check).await,
+        Scheme::Https => match tls::wrap(stream, at).await {
+            Ok(stream) => http::get(stream, at, check).await,
+            Err(error) => {
+                let why = format!("{at} does not speak TLS: {}", chain(&error));
+                return Answer::Failure(shorten(&why));
+            }
+        },
+    };
+    match got {
         Ok((status, _)) if (200..400).contains(&status) => Answer::Success,
         Ok((status, body)) => match shorten(&body) {
             body if body.is_empty() => Answer::Failure(format!("HTTP status {status}")),

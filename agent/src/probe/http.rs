@@ -9,13 +9,13 @@ use http_body_util::{BodyExt, Empty};
 use hyper::client::conn::http1;
 use hyper_util::rt::TokioIo;
 use muster_api::kind::task::probe::HttpCheck;
-use tokio::net::TcpStream;
+use tokio::io::{AsyncRead, AsyncWrite};
 
 use crate::runtime::KEPT_WORDS;
 
 /// The status, and the beginning of what came with it.
 pub(super) async fn get(
-    stream: TcpStream,
+    stream: impl AsyncRead + AsyncWrite + Unpin,
     at: SocketAddr,
     check: &HttpCheck,
 ) -> Result<(u16, String), hyper::Error> {

@@ -9,6 +9,7 @@
 //! | [`check`] | a probe of a spec as the check that it is, and its answer within its timeout |
 //! | [`connect`] | a connection in a task's own network |
 //! | [`http`] | a GET over one |
+//! | [`tls`] | the same, encrypted |
 //!
 //! A [`Probing`] belongs to the driver of its task and to one attempt. Before the driver ends an attempt, or says that it
 //! has ended, it waits for [`Probing::end`]: no check of it is left then.
@@ -16,6 +17,7 @@
 mod check;
 mod connect;
 mod http;
+mod tls;
 
 use std::collections::BTreeMap;
 use std::sync::Arc;

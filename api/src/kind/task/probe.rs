@@ -79,6 +79,9 @@ pub enum Scheme {
     #[default]
     #[serde(rename = "HTTP")]
     Http,
+    /// Over TLS 1.3; whatever certificate is shown is taken.
+    #[serde(rename = "HTTPS")]
+    Https,
 }
 
 /// A header of a check over HTTP.

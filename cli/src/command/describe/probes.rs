@@ -1,6 +1,6 @@
 //! A task's probes, and what each says now.
 
-use muster_api::kind::task::probe::{Probe, address};
+use muster_api::kind::task::probe::{Probe, Scheme, address};
 use muster_api::kind::task::{LIVENESS_FAILED, STARTING_UP, STARTUP_FAILED, TaskSpec, TaskStatus};
 use muster_api::phase::TaskPhase;
 
@@ -35,7 +35,11 @@ fn check(probe: &Probe) -> String {
     if let Some(exec) = &probe.exec {
         format!("runs {}", command_line(&exec.command))
     } else if let Some(http) = &probe.http {
-        format!("gets http://{}{}", at(&http.host, http.port), http.path)
+        let scheme = match http.scheme {
+            Scheme::Http => "http",
+            Scheme::Https => "https",
+        };
+        format!("gets {scheme}://{}{}", at(&http.host, http.port), http.path)
     } else if let Some(tcp) = &probe.tcp {
         format!("connects to {}", at(&tcp.host, tcp.port))
     } else {

@@ -3,10 +3,13 @@
 mod model;
 mod world;
 
+use std::time::Duration;
+
 use muster_api::condition::ConditionStatus;
 use muster_api::phase::TaskPhase;
 use serde_json::json;
 
+use super::health::{Health, health};
 use super::view::Claim;
 use super::{Action, Ending, NewTask, Place};
 use world::World;
@@ -152,6 +155,24 @@ fn a_probe_that_never_says_ready_ends_the_rollout_at_the_deadline() {
     assert_eq!(why.reason, "ProbeFailed");
     let said = "was not ready within 30 s: its readiness probe failed: HTTP status 503";
     assert!(why.message.ends_with(said), "{}", why.message);
+}
+
+#[test]
+fn a_task_is_available_when_it_has_been_ready_for_long_enough() {
+    let mut world = three();
+    let (now, min_ready) = (world.now, Duration::from_secs(5));
+    let ago = |seconds| now - jiff::SignedDuration::from_secs(seconds);
+    let task = world.task("set-0");
+    task.started = Some(ago(100));
+    assert_eq!(health(task, min_ready, now), Health::Available, "it has no probe");
+    (task.ready, task.ready_since) = (Some(true), Some(ago(3)));
+    let available_at = now + jiff::SignedDuration::from_secs(2);
+    assert_eq!(health(task, min_ready, now), Health::Ready { available_at });
+    assert_eq!(health(task, Duration::ZERO, now), Health::Available);
+    task.ready_since = Some(ago(5));
+    assert_eq!(health(task, min_ready, now), Health::Available);
+    task.ready = Some(false);
+    assert_eq!(health(task, Duration::ZERO, now), Health::NotReady);
 }
 
 #[test]
