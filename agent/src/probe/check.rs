@@ -2,7 +2,6 @@
 
 use std::future::Future;
 use std::net::SocketAddr;
-use std::time::Duration;
 
 use futures::FutureExt;
 use muster_agent_core::probe::{Answer, shorten};
@@ -69,19 +68,18 @@ impl Check {
                 Ok(executed) => executed_answer(executed, self.timeout),
                 Err(error) => unknown(&error),
             },
+            // An answer that is there counts, however late anybody looks.
             What::Http(at, check) => tokio::select! {
+                biased;
                 answer = over_http(runtime, launch, *at, check) => answer,
                 () = until => too_late(),
             },
             What::Tcp(at) => tokio::select! {
+                biased;
                 answer = over_tcp(runtime, launch, *at) => answer,
                 () = until => too_late(),
             },
-            What::Unknown => {
-                // Its turn comes again: not at once.
-                tokio::time::sleep(Duration::from_secs(1)).await;
-                Answer::Unknown("this agent knows no such check".to_owned())
-            }
+            What::Unknown => Answer::Unknown("this agent knows no such check".to_owned()),
         }
     }
 }

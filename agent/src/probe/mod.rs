@@ -19,16 +19,15 @@ mod connect;
 mod http;
 mod tls;
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
-use futures::future::{BoxFuture, FutureExt};
-use futures::stream::{FuturesUnordered, StreamExt};
 use muster_agent_core::probe::{Answer, Prober, Probes, Role, Timing, Verdict};
 use muster_agent_core::time::Boot;
 use muster_agent_core::workload::{State, Workload};
 use muster_api::kind::task::TaskSpec;
 use muster_api::kind::task::probe::Probe;
+use tokio::task::{JoinError, JoinSet};
 use tokio_util::sync::CancellationToken;
 
 use crate::clock;
@@ -44,9 +43,11 @@ pub(crate) struct Probing {
     checks: BTreeMap<Role, Arc<Check>>,
     runtime: Arc<dyn Runtime>,
     launch: Arc<Launch>,
-    /// At most one of a role.
-    under_way: FuturesUnordered<BoxFuture<'static, (Role, Answer)>>,
+    /// At most one of a role. Tasks of their own: they go on, and are in time, while the driver waits for its disk.
+    under_way: JoinSet<(Role, Answer)>,
     over: CancellationToken,
+    /// Those of which it was said that they cannot be made.
+    warned: BTreeSet<Role>,
 }
 
 impl Probing {
@@ -75,8 +76,9 @@ impl Probing {
             checks: roles(spec).into_iter().filter_map(check).collect(),
             runtime: Arc::clone(runtime),
             launch: Arc::new(launch()),
-            under_way: FuturesUnordered::new(),
+            under_way: JoinSet::new(),
             over: CancellationToken::new(),
+            warned: BTreeSet::new(),
         })
     }
 
@@ -86,11 +88,10 @@ impl Probing {
             for role in self.prober.due(clock::boot()) {
                 self.make(role);
             }
-            // Cancel-safe: a set of futures that stay in it, and a sleep whose deadline is kept.
+            // Cancel-safe: `join_next` is, and a sleep whose deadline is kept.
             tokio::select! {
-                Some((role, answer)) = self.under_way.next() => {
-                    tracing::debug!(id = %self.launch.id, %role, ?answer, "probe");
-                    if let Some(verdict) = self.prober.answer(role, answer) {
+                Some(answered) = self.under_way.join_next() => {
+                    if let Some(verdict) = self.answered(answered) {
                         return verdict;
                     }
                 }
@@ -99,20 +100,45 @@ impl Probing {
         }
     }
 
+    fn answered(&mut self, answered: Result<(Role, Answer), JoinError>) -> Option<Verdict> {
+        match answered {
+            Ok((role, answer)) => {
+                self.log(role, &answer);
+                self.prober.answer(role, answer)
+            }
+            // It panicked: this probe is not made again before another attempt, or life of the agent.
+            Err(error) => {
+                tracing::error!(id = %self.launch.id, %error, "a check ended unexpectedly");
+                None
+            }
+        }
+    }
+
+    /// A probe that cannot be made changes nothing: somebody has to hear of it.
+    fn log(&mut self, role: Role, answer: &Answer) {
+        let id = &self.launch.id;
+        match answer {
+            Answer::Unknown(why) if self.warned.insert(role) => {
+                tracing::warn!(%id, %role, why, "a check cannot be made, and says nothing");
+            }
+            answer => tracing::debug!(%id, %role, ?answer, "probe"),
+        }
+    }
+
     fn make(&mut self, role: Role) {
         // The spec and what the core knows of it come together, so there is one.
         let Some(check) = self.checks.get(&role).map(Arc::clone) else { return };
         let (runtime, launch) = (Arc::clone(&self.runtime), Arc::clone(&self.launch));
         let over = self.over.clone();
-        let answer =
-            async move { (role, check.answer(runtime.as_ref(), &launch, over.cancelled()).await) };
-        self.under_way.push(answer.boxed());
+        self.under_way.spawn(async move {
+            (role, check.answer(runtime.as_ref(), &launch, over.cancelled()).await)
+        });
     }
 
     /// Ends the checks that are under way; their answers are dropped.
     pub(crate) async fn end(mut self) {
         self.over.cancel();
-        while self.under_way.next().await.is_some() {}
+        while self.under_way.join_next().await.is_some() {}
     }
 }
 

@@ -149,8 +149,11 @@ fn says(status: &TaskSetStatus, reason: &str) -> bool {
     status.condition("Progressing").is_some_and(|c| c.reason == reason)
 }
 
-async fn change(cluster: &Cluster, template: Value) {
-    let patch = Patch::Merge(json!({"spec": {"template": {"spec": template}}}));
+/// Changes what the set's tasks are, and how long one has to become Ready, seconds.
+async fn change(cluster: &Cluster, template: Value, deadline: u32) {
+    let rollout = json!({"progressDeadlineSeconds": deadline});
+    let patch = json!({"spec": {"template": {"spec": template}, "rollout": rollout}});
+    let patch = Patch::Merge(patch);
     let api = sets(cluster).await;
     api.patch("serve", &PatchParams::default(), &patch).await.expect("it is taken");
 }
@@ -211,7 +214,7 @@ async fn a_rollout_waits_for_ready_and_goes_back_when_a_probe_fails() {
     status(&cluster, "complete", complete).await;
 
     // Each new task runs and is not ready: the next is changed when it is.
-    change(&cluster, json!({"run": run(second), "readiness": probe(second)})).await;
+    change(&cluster, json!({"run": run(second), "readiness": probe(second)}), 600).await;
     for changed in 1..=3 {
         let tried = wait::until("a new task that is not ready", || async {
             let (new, old) = split(&cluster, second).await;
@@ -234,23 +237,20 @@ async fn a_rollout_waits_for_ready_and_goes_back_when_a_probe_fails() {
     status(&cluster, "complete", complete).await;
     let before = processes(&split(&cluster, second).await.0);
 
-    // Never ready.
-    let deadline = Patch::Merge(json!({"spec": {"rollout": {"progressDeadlineSeconds": 4}}}));
-    let api = sets(&cluster).await;
-    api.patch("serve", &PatchParams::default(), &deadline).await.expect("it is taken");
+    // Never ready in time.
     let fails = json!({"exec": {"command": ["sh", "-c", "echo no map; exit 7"]},
         "period": "200ms", "timeout": "20s", "failureThreshold": 1});
-    change(&cluster, json!({"readiness": fails})).await;
+    change(&cluster, json!({"readiness": fails}), 8).await;
     let back = |s: &TaskSetStatus| {
         says(s, "RolledBack") && s.available_replicas == 3 && s.replacing.is_empty()
     };
     let why = status(&cluster, "rolled back", back).await.rolled_back_from.expect("given up");
     assert_eq!(why.reason, "ProbeFailed", "{}", why.message);
-    let said = "was not ready within 4 s: its readiness probe failed: exited with code 7: no map";
+    let said = "was not ready within 8 s: its readiness probe failed: exited with code 7: no map";
     assert!(why.message.ends_with(said), "{}", why.message);
 
-    // Not alive.
-    change(&cluster, json!({"readiness": probe(second), "liveness": fails})).await;
+    // Not alive, before it could be ready.
+    change(&cluster, json!({"readiness": fails, "liveness": fails}), 600).await;
     let not_alive = |s: &TaskSetStatus| {
         back(s) && s.rolled_back_from.as_ref().is_some_and(|r| r.reason == "Crashed")
     };

@@ -62,6 +62,8 @@ pub(super) async fn exec(
     let id = docker.create_exec(container, config).await.map_err(failed)?.id;
     let mut said = Vec::new();
     let over = tokio::select! {
+        // As of a process: an answer that is there counts.
+        biased;
         over = listen(docker, &id, &mut said) => Some(over?),
         () = until => None,
     };

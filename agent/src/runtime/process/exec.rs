@@ -43,6 +43,8 @@ pub(super) async fn exec(
         .map_err(|error| RuntimeError::new(WHAT, error))?;
     // Cancel-safe: dropped whole, which closes `keep` and so kills the program.
     let done = tokio::select! {
+        // An answer that is there counts, however late anybody looks.
+        biased;
         done = &mut answered => done,
         () = until => {
             drop(keep);
