@@ -5,6 +5,7 @@
 //! | inbox (from the supervisor) | an mpsc receiver |
 //! | runtime operations under way | futures owned by the driver, polled in place |
 //! | the next wake-up | a sleep; the deadline itself is kept |
+//! | probes of a running attempt | see [`Probing::verdict`] |
 //!
 //! A driver ends when its task is dropped, or when the inbox closes: the agent is going down, and
 //! the task's processes stay.
@@ -17,7 +18,7 @@ use futures::future::{AbortHandle, Abortable, BoxFuture, FutureExt};
 use futures::stream::{FuturesUnordered, StreamExt};
 use muster_agent_core::desired::{Desired, StopTimes};
 use muster_agent_core::time::Boot;
-use muster_agent_core::workload::{Context, Effect, Event, Outcome, Response, Workload};
+use muster_agent_core::workload::{Context, Effect, Event, Outcome, Response, State, Workload};
 use muster_api::id::TaskUid;
 use tokio::sync::mpsc;
 
@@ -31,6 +32,7 @@ use crate::executor::desk::Desks;
 use crate::executor::seat::Seat;
 use crate::given;
 use crate::given::files::Place;
+use crate::probe::Probing;
 use crate::runtime::{AttemptId, Launch, Launched, Runtime};
 use crate::spec::{self, Kind, Surroundings};
 
@@ -129,6 +131,8 @@ pub(crate) struct Driver {
     files: bool,
     /// While processes of the task may exist: it may be an executor.
     seat: Option<Seat>,
+    /// While an attempt runs that has probes.
+    probing: Option<Probing>,
     dropped: bool,
 }
 
@@ -195,6 +199,7 @@ pub(crate) async fn drive(
         unkept,
         files,
         seat: None,
+        probing: None,
         dropped: false,
     };
     driver.carry_out(response).await;
@@ -226,6 +231,7 @@ impl Driver {
                     }
                 },
                 Some(event) = self.operations.next() => event,
+                event = verdict(&mut self.probing) => Some(event),
                 () = sleep_until(wake) => {
                     let now = clock::boot();
                     self.wakes.retain(|wake| *wake > now);
@@ -314,8 +320,23 @@ impl Driver {
         }
     }
 
+    /// Probes what runs, and nothing else. Before anything is told or ended: no check outlives its attempt.
+    async fn probe(&mut self) {
+        let workload = &self.record.workload;
+        let runs = matches!(workload.state, State::Running { .. });
+        let other = |probing: &Probing| !runs || probing.attempt != workload.attempt;
+        if let Some(probing) = self.probing.take_if(|probing| other(probing)) {
+            probing.end().await;
+        }
+        if self.probing.is_none() {
+            let (workload, spec) = (&self.record.workload, &self.record.assignment.spec);
+            self.probing = Probing::begin(workload, spec, &self.runtime, || self.launch());
+        }
+    }
+
     async fn carry_out(&mut self, response: Response) {
         self.attend().await;
+        self.probe().await;
         for effect in response.effects {
             match effect {
                 Effect::Persist => {
@@ -474,7 +495,15 @@ where
     }
 }
 
-async fn sleep_until(wake: Option<Boot>) {
+/// The next verdict on the attempt that runs.
+async fn verdict(probing: &mut Option<Probing>) -> Event {
+    match probing {
+        Some(probing) => Event::Probed(probing.attempt, probing.verdict().await),
+        None => std::future::pending().await,
+    }
+}
+
+pub(crate) async fn sleep_until(wake: Option<Boot>) {
     match wake {
         Some(wake) => {
             let left = wake.0.saturating_sub(clock::boot().0);

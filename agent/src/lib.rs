@@ -21,6 +21,7 @@
 //! | `contact` | when the controller was last heard, for the shims too |
 //! | `link` | joining, the session, logs on request |
 //! | `node`, `capacity`, `position` | what this node is, has, and where it is |
+//! | `probe` | checks of running tasks |
 //! | `runtime`, `shim` | what runs tasks |
 
 mod app;
@@ -40,6 +41,7 @@ mod given;
 mod link;
 mod node;
 mod position;
+mod probe;
 mod runtime;
 pub mod shim;
 mod spec;

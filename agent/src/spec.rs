@@ -11,6 +11,7 @@ use muster_api::wire::agent_session::spec_from_wire;
 
 use crate::checkpoint::Assignment;
 use crate::executor;
+use crate::probe;
 use crate::runtime::launch::{
     AttemptId, Container, Launch, Lease, Limits, Mount, Network, Program, Pull, Work,
 };
@@ -78,6 +79,7 @@ pub(crate) fn desired(spec: &TaskSpec, stop: Option<StopOrder>) -> Desired {
         stop_after_ms: spec
             .stop_after_disconnect()
             .map(|span| u64::try_from(span.as_duration().as_millis()).unwrap_or(u64::MAX)),
+        probes: probe::probes(spec),
         stop,
     }
 }

@@ -263,3 +263,90 @@ fn a_container_is_an_executor_and_its_limits_follow_its_works() {
     assert_eq!(controller.wait_end("d-work").reason, "ExecutorLost");
     assert_eq!(controller.wait_end("d-exec").signal, Some(9));
 }
+
+/// Waits until the newest report says whether the task is ready.
+#[track_caller]
+fn wait_ready(controller: &Controller, uid: &str, ready: bool) -> proto::TaskReport {
+    until("a word on readiness", || {
+        controller.reports(uid).pop().filter(|report| report.ready == Some(ready))
+    })
+}
+
+/// A container that serves its run directory, and is asked for a file of it.
+fn served(network: &str, port: u16) -> Value {
+    json!({
+        "run": { "container": { "image": image(), "network": network,
+            "command": ["/bin/busybox", "httpd", "-f", "-p", port.to_string(), "-h", "/run/muster"] } },
+        "readiness": { "http": { "path": "/ready", "port": port }, "period": "100ms",
+            "timeout": "20s", "failureThreshold": 1 },
+        "liveness": { "tcp": { "port": port }, "period": "100ms", "timeout": "20s",
+            "initialDelay": "2s", "failureThreshold": 1000 },
+    })
+}
+
+#[test]
+fn probes_reach_a_container_in_each_network() {
+    let _cleanup = Cleanup(vec!["d-net-none", "d-net-bridge", "d-net-host"]);
+    let controller = Controller::start();
+    let agent = start(&controller);
+    let free = std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
+    // The same port in two networks of their own: each is asked in its own.
+    for (uid, network, port) in
+        [("d-net-none", "None", 80), ("d-net-bridge", "Bridge", 80), ("d-net-host", "Host", free)]
+    {
+        controller.assign(uid, served(network, port));
+        controller.wait_running(uid);
+    }
+    for uid in ["d-net-none", "d-net-bridge", "d-net-host"] {
+        controller.wait(uid, "answer", |report| report.message.contains("HTTP status 404"));
+        let file = agent.task_dir(uid).join("run/ready");
+        std::fs::write(&file, "").unwrap();
+        wait_ready(&controller, uid, true);
+        std::fs::remove_file(&file).unwrap();
+        wait_ready(&controller, uid, false);
+        controller.stop(uid, 0);
+        assert_eq!(controller.wait_end(uid).attempt, 1, "it was alive");
+    }
+}
+
+#[test]
+fn a_check_runs_inside_its_container_and_is_killed_when_it_takes_too_long() {
+    let _cleanup = Cleanup(vec!["d-check", "d-late", "d-nocheck"]);
+    let controller = Controller::start();
+    let agent = start(&controller);
+    let exec = |argv: Value| json!({ "exec": { "command": argv }, "period": "200ms", "timeout": "20s", "failureThreshold": 1 });
+    let mut spec = sh("trap 'exit 0' TERM; while :; do sleep 0.1; done");
+    spec["run"]["container"]["env"] = json!([{ "name": "A", "value": "b" }]);
+    spec["readiness"] =
+        exec(json!(["/bin/sh", "-c", "[ -e /run/muster/ok ] || { echo $A is missing; exit 3; }"]));
+    spec["liveness"] =
+        exec(json!(["/bin/sh", "-c", "[ ! -e /run/muster/hung ] || { echo hung; exit 1; }"]));
+    controller.assign("d-check", spec);
+    controller
+        .wait("d-check", "answer", |r| r.message.contains("exited with code 3: b is missing"));
+    let run = agent.task_dir("d-check").join("run");
+    std::fs::write(run.join("ok"), "").unwrap();
+    wait_ready(&controller, "d-check", true);
+    std::fs::write(run.join("hung"), "").unwrap();
+    let end = controller.wait_end("d-check");
+    assert_eq!((end.phase(), end.reason.as_str()), (proto::TaskPhase::Failed, "LivenessFailed"));
+    assert_eq!(end.message, "its liveness probe failed: exited with code 1: hung");
+
+    let mut spec = sh("exec sleep 1000");
+    spec["readiness"] = exec(json!(["/bin/sleep", "1234"]));
+    spec["readiness"]["timeout"] = json!("1s");
+    spec["readiness"]["period"] = json!("1h");
+    controller.assign("d-late", spec);
+    let id = container("d-late");
+    controller.wait("d-late", "timeout", |r| r.message.contains("no answer within 1s"));
+    until("the end of the check", || (!docker(&["top", &id]).contains("1234")).then_some(()));
+    controller.stop("d-late", 0);
+    controller.wait_end("d-late");
+
+    let mut spec = sh("exec sleep 1000");
+    spec["startup"] = exec(json!(["/no/such/check"]));
+    controller.assign("d-nocheck", spec);
+    let end = controller.wait_end("d-nocheck");
+    assert_eq!(end.reason, "StartupFailed");
+    assert!(end.message.contains("/no/such/check"), "{end:?}");
+}

@@ -61,3 +61,26 @@ fn without_groups_nothing_of_a_task_is_left_either() {
     assert_eq!(controller.wait_end("lost").reason, "ShimLost");
     assert!(!lives(pid));
 }
+
+#[test]
+fn without_groups_a_task_is_looked_at_too() {
+    let controller = Controller::start();
+    let agent = Agent::start_as_nobody(&controller, &["--unenforced-quotas"]);
+    let check =
+        "echo $$ > $MUSTER_RUN_DIR/check; id -u; trap '' TERM; while :; do sleep 0.05; done";
+    controller.assign(
+        "looked-at",
+        json!({
+            "run": { "process": { "command": ["sleep", "1000"] } },
+            "readiness": { "exec": { "command": ["sh", "-c", "exit $(id -u | cut -c 1)"] },
+                "period": "100ms", "timeout": "10s" },
+            "liveness": { "exec": { "command": ["sh", "-c", check] }, "timeout": "1h" },
+        }),
+    );
+    controller.wait("looked-at", "answer", |report| report.message.contains("exited with code 6"));
+    let file = agent.task_dir("looked-at").join("run/check");
+    let check: i32 = until("a check", || std::fs::read_to_string(&file).ok()?.trim().parse().ok());
+    controller.stop("looked-at", 600_000);
+    assert_eq!(controller.wait_end("looked-at").signal, Some(15));
+    assert!(!lives(check));
+}

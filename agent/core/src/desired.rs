@@ -2,6 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 
+use crate::probe::Probes;
+
 /// When a task whose main process ended starts again.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub enum RestartPolicy {
@@ -41,6 +43,18 @@ pub struct Desired {
     /// Present: it may run only while the controller was in contact within this time
     /// (`onDisconnect: Stop`), milliseconds.
     pub stop_after_ms: Option<u64>,
+    /// What is looked at while it runs.
+    #[serde(default)]
+    pub probes: Probes,
     /// Present: it must end.
     pub stop: Option<StopOrder>,
+}
+
+impl Desired {
+    /// A task that is not started again, may run without contact, and is not looked at.
+    #[must_use]
+    pub fn once(grace_ms: u64) -> Desired {
+        let (restart, probes) = (RestartPolicy::Never, Probes::default());
+        Desired { restart, grace_ms, stop_after_ms: None, probes, stop: None }
+    }
 }

@@ -2,6 +2,7 @@
 
 use crate::desired::Desired;
 use crate::observed::{Exit, Observed, Started};
+use crate::probe::Verdict;
 use crate::time::{Boot, Now};
 
 /// Why a runtime did not do its part. Nothing of the task ran.
@@ -29,6 +30,8 @@ pub enum Event {
     Tick,
     /// A runtime answered about the attempt of this number.
     Attempt(u32, Outcome),
+    /// The probes of the running attempt of this number say something new.
+    Probed(u32, Verdict),
     /// Everything of it is removed.
     Removed,
     /// Something of it could not be removed.

@@ -8,6 +8,7 @@
 //! | [`event`] | what goes into a decision, and what comes out of it |
 //! | [`workload`] | one task's state machine: `Event` in, `Response` out |
 //! | [`restart`] | when an ended task starts again, and after how long |
+//! | [`probe`] | when a running attempt is checked, and what follows from the answers |
 //! | [`report`] | what is told to the controller, and its sequence |
 //! | [`executor`] | an executor and the works it was given: who may end, and on whose word |
 //! | [`plan`] | a set of assignments against the tasks that are known: who gets which event |
@@ -22,6 +23,7 @@ pub mod event;
 pub mod executor;
 pub mod observed;
 pub mod plan;
+pub mod probe;
 pub mod report;
 pub mod restart;
 pub mod time;

@@ -98,10 +98,9 @@ pub fn plan(assignments: Assignments, known: &BTreeMap<TaskUid, bool>) -> Plan {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::desired::RestartPolicy;
 
     fn desired() -> Desired {
-        Desired { restart: RestartPolicy::Never, grace_ms: 0, stop_after_ms: None, stop: None }
+        Desired::once(0)
     }
 
     fn uid(name: &str) -> TaskUid {

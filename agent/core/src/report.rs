@@ -3,9 +3,11 @@
 
 use std::fmt;
 
+use muster_api::kind::task::{LIVENESS_FAILED, NOT_READY, STARTING_UP, STARTUP_FAILED};
 use serde::{Deserialize, Serialize};
 
 use crate::observed::{End, Exit, Loss, Said};
+use crate::probe::Role;
 use crate::time::Wall;
 
 /// Where a task is on this node.
@@ -58,6 +60,14 @@ pub enum Reason {
     ExecutorLost,
     /// Its executor ended it.
     Killed,
+    /// It runs, and its start-up probe has not succeeded.
+    StartingUp,
+    /// It runs, and its readiness probe does not succeed.
+    NotReady,
+    /// It was ended because its liveness probe failed.
+    LivenessFailed,
+    /// It was ended because its start-up probe failed.
+    StartupFailed,
     /// It waits for its executor.
     AwaitingExecutor,
     /// It waits before it is started again.
@@ -68,6 +78,17 @@ pub enum Reason {
     AssignmentUnreadable,
     /// A runtime's own word (`ImagePullFailed`, `QuotaNotEnforced` …).
     Runtime(String),
+}
+
+impl Reason {
+    /// Why an attempt is ended whose probe of this role failed.
+    #[must_use]
+    pub fn failed(role: Role) -> Reason {
+        match role {
+            Role::Startup => Reason::StartupFailed,
+            Role::Readiness | Role::Liveness => Reason::LivenessFailed,
+        }
+    }
 }
 
 impl fmt::Display for Reason {
@@ -85,6 +106,10 @@ impl fmt::Display for Reason {
             Reason::ContainerLost => "ContainerLost",
             Reason::ExecutorLost => "ExecutorLost",
             Reason::Killed => "Killed",
+            Reason::StartingUp => STARTING_UP,
+            Reason::NotReady => NOT_READY,
+            Reason::LivenessFailed => LIVENESS_FAILED,
+            Reason::StartupFailed => STARTUP_FAILED,
             Reason::AwaitingExecutor => "AwaitingExecutor",
             Reason::BackOff => "BackOff",
             Reason::AwaitingContact => "AwaitingContact",
@@ -115,6 +140,9 @@ pub struct Content {
     pub started_at: Option<Wall>,
     /// When the attempt's last process was gone.
     pub finished_at: Option<Wall>,
+    /// Whether its probes say that it serves, true only while it runs; none of them says that: `None`.
+    #[serde(default)]
+    pub ready: Option<bool>,
 }
 
 /// A numbered report.
@@ -142,6 +170,7 @@ impl Report {
                 signal: None,
                 started_at: None,
                 finished_at: None,
+                ready: None,
             },
         }
     }

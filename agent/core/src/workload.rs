@@ -11,15 +11,19 @@
 //! launch begins, and a number is used again only when a runtime has said that nothing of it was
 //! ever started.
 
+mod probed;
+
 use muster_api::id::TaskUid;
 use serde::{Deserialize, Serialize};
 
-use crate::desired::{Desired, RestartPolicy, StopOrder};
+use crate::desired::{Desired, StopOrder};
 pub use crate::event::{Context, Effect, Event, Failure, Outcome, Response};
 use crate::observed::{End, Exit, Loss, Observed, Started};
+use crate::probe::Verdicts;
 use crate::report::{Content, Phase, Reason, Report, explain};
 use crate::restart;
 use crate::time::Boot;
+pub use probed::Condemned;
 
 /// A stop that has not ended the task this long after its grace is asked for again: the runtime may
 /// have lost it (an engine that was started anew, a shim that died).
@@ -139,6 +143,12 @@ pub struct Workload {
     pub restarts: u32,
     /// Failures in a row.
     pub failures: u32,
+    /// What its probes have found of the current attempt.
+    #[serde(default)]
+    pub verdicts: Verdicts,
+    /// The current attempt is to be ended, because a probe failed.
+    #[serde(default)]
+    pub condemned: Option<Condemned>,
     /// What is told about it.
     pub report: Report,
 }
@@ -162,9 +172,7 @@ impl Workload {
     /// A task whose assignment cannot be read: it ends before it begins, and says why. `message`
     /// names the field.
     pub fn unreadable(uid: TaskUid, message: String, context: Context) -> (Workload, Response) {
-        let desired =
-            Desired { restart: RestartPolicy::Never, grace_ms: 0, stop_after_ms: None, stop: None };
-        let mut workload = Workload::new(uid, desired, Fetch::Nothing, State::Ended);
+        let mut workload = Workload::new(uid, Desired::once(0), Fetch::Nothing, State::Ended);
         let mut content = workload.report_draft();
         content.phase = Phase::Failed;
         content.reason = Reason::AssignmentUnreadable;
@@ -189,6 +197,8 @@ impl Workload {
             unused: false,
             restarts: 0,
             failures: 0,
+            verdicts: Verdicts::default(),
+            condemned: None,
             report: Report::accepted(),
         }
     }
@@ -232,6 +242,10 @@ impl Workload {
             }
             // The answer to a question about an attempt that is over.
             Event::Attempt(..) => {}
+            Event::Probed(attempt, verdict) if attempt == self.attempt => {
+                self.on_verdict(verdict, context, &mut effects);
+            }
+            Event::Probed(..) => {}
             Event::Removed => {
                 if matches!(self.state, State::Removing { .. }) {
                     return Response { effects: vec![Effect::Drop] };
@@ -253,12 +267,14 @@ impl Workload {
         let mut all = vec![Effect::Persist];
         if !matches!(self.state, State::Removing { .. }) {
             let content = self.content();
+            let begins =
+                content.phase == Phase::Running && self.report.content.phase != Phase::Running;
             self.report.update(content);
             // "It runs" is told before it is written down, because somebody waits for it, and
             // because nothing depends on it: the launch is durable, and another life of the agent
             // finds what runs. Its sequence then begins above anything that was told (see
             // `restored`).
-            let at = if matches!(self.state, State::Running { .. }) { 0 } else { 1 };
+            let at = if begins { 0 } else { 1 };
             all.insert(at, Effect::Publish);
         }
         all.extend(effects);
@@ -396,6 +412,7 @@ impl Workload {
 
     fn launch(&mut self, effects: &mut Vec<Effect>) {
         self.state = State::Launching;
+        self.forget_verdicts();
         self.say(Reason::None, String::new());
         effects.push(Effect::Launch(self.attempt));
     }
@@ -489,14 +506,19 @@ impl Workload {
             content.reason = Reason::Stopped;
             content.message.clone_from(&order.reason);
         }
-        let again = self.desired.stop.is_none()
-            && !self.forgotten
-            && restart::restarts(self.desired.restart, exit);
+        let by_itself =
+            matches!(content.reason, Reason::Completed | Reason::Error | Reason::Killed);
+        if let Some(failed) = self.condemned_for().filter(|_| by_itself) {
+            (content.reason, content.message) = failed;
+        }
+        let again = self.runs_again(exit);
+        let condemned = self.condemned.take().is_some();
         if again {
             self.restarts += 1;
             content.restarts = self.restarts;
         } else {
-            content.phase = if exit.succeeded() { Phase::Succeeded } else { Phase::Failed };
+            let well = exit.succeeded() && !condemned;
+            content.phase = if well { Phase::Succeeded } else { Phase::Failed };
         }
         let (reason, message) = (content.reason.clone(), content.message.clone());
         self.report.update(content);
@@ -525,7 +547,7 @@ impl Workload {
 
     /// Brings the task nearer to its end if it is to end.
     fn end_if_wanted(&mut self, context: Context, effects: &mut Vec<Effect>) {
-        if !self.forgotten && self.desired.stop.is_none() {
+        if !self.forgotten && self.desired.stop.is_none() && self.condemned.is_none() {
             return;
         }
         match self.state {
@@ -558,7 +580,8 @@ impl Workload {
         let again = context.now.boot.plus(grace_ms.saturating_add(STOP_AGAIN_MS));
         self.state = State::Stopping { started, again, refused };
         let why = self.desired.stop.as_ref().map(|order| order.reason.clone()).unwrap_or_default();
-        self.say(Reason::Stopped, why);
+        let (reason, why) = self.condemned_for().unwrap_or((Reason::Stopped, why));
+        self.say(reason, why);
         effects.push(Effect::Stop { attempt: self.attempt, grace_ms });
         effects.push(Effect::WakeAt(again));
     }
@@ -616,6 +639,7 @@ impl Workload {
             // What was last said is still the best that is known.
             State::Recovering { .. } | State::Ended | State::Removing { .. } => {}
         }
+        self.say_ready(&mut content);
         content
     }
 }

@@ -6,13 +6,19 @@ use std::collections::BTreeMap;
 
 use muster_agent_core::desired::{Desired, RestartPolicy, StopOrder};
 use muster_agent_core::observed::{End, Exit, Loss, Observed, Started};
-use muster_agent_core::report::Report;
+use muster_agent_core::probe::{Probes, Role, Timing, Verdict};
+use muster_agent_core::report::{Phase, Report};
 use muster_agent_core::time::{Boot, Now, Wall};
 use muster_agent_core::workload::{
     Context, Effect, Event, Failure, Fetch, Outcome, Response, State, Workload,
 };
 use muster_api::id::TaskUid;
 use proptest::prelude::*;
+
+const TIMING: Timing =
+    Timing { initial_delay_ms: 0, period_ms: 1, success_threshold: 1, failure_threshold: 1 };
+const PROBES: Probes =
+    Probes { startup: Some(TIMING), readiness: Some(TIMING), liveness: Some(TIMING) };
 
 #[derive(Debug, Clone)]
 enum Action {
@@ -33,6 +39,8 @@ enum Action {
     /// The program ends by itself.
     Ends(i32),
     Pass(u64),
+    /// The probes of the attempt that is this many before the present one say something.
+    Probed(u32, Verdict),
     Stop(u64),
     Unassign,
     Forget,
@@ -51,10 +59,22 @@ fn action() -> impl Strategy<Value = Action> {
         1 => Just(Action::Evict),
         4 => prop_oneof![Just(0), Just(1)].prop_map(Action::Ends),
         4 => (1..400_000_u64).prop_map(Action::Pass),
+        3 => (0..2_u32, verdict()).prop_map(|(ago, verdict)| Action::Probed(ago, verdict)),
         1 => (0..20_000_u64).prop_map(Action::Stop),
         1 => Just(Action::Unassign),
         1 => Just(Action::Forget),
         1 => policy().prop_map(Action::Wish),
+    ]
+}
+
+fn verdict() -> impl Strategy<Value = Verdict> {
+    let why = || "no".to_owned();
+    prop_oneof![
+        4 => Just(Verdict::Started),
+        4 => Just(Verdict::Ready),
+        2 => Just(Verdict::NotReady { why: why() }),
+        1 => Just(Verdict::Failed { role: Role::Startup, why: why() }),
+        1 => Just(Verdict::Failed { role: Role::Liveness, why: why() }),
     ]
 }
 
@@ -101,7 +121,7 @@ struct World {
 
 impl World {
     fn new(policy: RestartPolicy, fetch: Fetch) -> World {
-        let desired = Desired { restart: policy, grace_ms: 1_000, stop_after_ms: None, stop: None };
+        let desired = Desired { restart: policy, probes: PROBES, ..Desired::once(1_000) };
         let mut world = World {
             now: 0,
             fetch,
@@ -183,6 +203,8 @@ impl World {
         if report.content.phase.is_terminal() {
             assert_eq!(self.live(), 0, "said to have ended while it lives: {report:?}");
         }
+        let ready = report.content.ready.expect("its probes say so or not");
+        assert!(!ready || report.content.phase == Phase::Running, "ready, not running: {report:?}");
         if let Some(before) = &self.told {
             assert!(report.sequence >= before.sequence, "{before:?} then {report:?}");
             if report.sequence == before.sequence {
@@ -357,6 +379,19 @@ impl World {
                 }
                 self.handle(Event::Tick);
             }
+            Action::Probed(ago, verdict) => {
+                let Some(agent) = &self.agent else { return };
+                let (attempt, ready) = (agent.attempt, agent.report.content.ready);
+                let before = self.told.clone();
+                self.handle(Event::Probed(attempt.wrapping_sub(ago), verdict.clone()));
+                if ago > 0 {
+                    assert_eq!(self.told, before, "an earlier attempt's verdict counts");
+                } else if let (Some(agent), Verdict::Ready) = (&self.agent, verdict) {
+                    let started = agent.verdicts.started;
+                    let now = agent.report.content.ready;
+                    assert!(now == ready || started, "ready before it has started");
+                }
+            }
             Action::Stop(grace_ms) => {
                 self.desired.stop = Some(StopOrder { grace_ms, reason: "Deleted".to_owned() });
                 self.handle(Event::Assigned(self.desired.clone()));
@@ -373,6 +408,8 @@ impl World {
     /// Without faults, everything goes on.
     fn settle(&mut self) {
         self.crash_after = None;
+        // What is to end for its probe ends here as by an order.
+        self.stopping |= self.agent.as_ref().is_some_and(|agent| agent.condemned.is_some());
         for _ in 0..60 {
             for index in 0..self.under_way.len() {
                 self.perform(index, false);

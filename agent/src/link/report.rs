@@ -22,6 +22,7 @@ pub(crate) fn to_wire(uid: &TaskUid, report: &Report) -> proto::TaskReport {
         finished_at: content.finished_at.map(|at| time(at).into()),
         restarts: content.restarts,
         signal: content.signal,
+        ready: content.ready,
     }
 }
 

@@ -18,8 +18,10 @@ pub(crate) mod launch;
 pub(crate) mod logs;
 pub(crate) mod process;
 
+use std::os::fd::OwnedFd;
+
 use bytes::Bytes;
-use futures::future::BoxFuture;
+use futures::future::{BoxFuture, FutureExt};
 use futures::stream::BoxStream;
 use muster_agent_core::desired::StopTimes;
 use muster_agent_core::observed::{Exit, Observed, Started};
@@ -27,6 +29,29 @@ use muster_agent_core::workload::Failure;
 use muster_api::id::TaskUid;
 
 pub(crate) use launch::{AttemptId, Launch, Limits, Used};
+
+/// What came of a program that was run beside an attempt.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) enum Executed {
+    /// It ended with this code, as a shell shows it, and said this.
+    Ended { code: i32, said: String },
+    /// It could not be started, by its own fault: why.
+    NotStarted(String),
+    /// It was killed before it ended, and had said this.
+    Cut { said: String },
+}
+
+/// How much of what a check says is kept, bytes.
+pub(crate) const KEPT_WORDS: usize = 4 << 10;
+
+/// Where a running attempt can be reached over the network.
+#[derive(Debug)]
+pub(crate) enum Reached {
+    /// In the node's own network.
+    Here,
+    /// In the network namespace of this descriptor.
+    Inside(OwnedFd),
+}
 
 /// What came of a launch.
 #[derive(Debug)]
@@ -95,6 +120,21 @@ pub(crate) trait Runtime: Send + Sync + std::fmt::Debug {
         id: &'a AttemptId,
         limits: &'a Limits,
     ) -> BoxFuture<'a, Result<(), RuntimeError>>;
+    /// Runs a program beside a running attempt: in its group, as its user, in its directory and with its environment.
+    /// It is killed whole when `until` resolves first. A runtime without processes of its own runs none.
+    fn exec<'a>(
+        &'a self,
+        _: &'a Launch,
+        _: &'a [String],
+        _: BoxFuture<'a, ()>,
+    ) -> BoxFuture<'a, Result<Executed, RuntimeError>> {
+        let error = RuntimeError::new("run a program beside a task", "it has no processes");
+        futures::future::ready(Err(error)).boxed()
+    }
+    /// The network of a running attempt.
+    fn network<'a>(&'a self, _: &'a Launch) -> BoxFuture<'a, Result<Reached, RuntimeError>> {
+        futures::future::ready(Ok(Reached::Here)).boxed()
+    }
     /// Removes every trace of a task of which nothing runs.
     fn remove<'a>(&'a self, uid: &'a TaskUid) -> BoxFuture<'a, Result<(), RuntimeError>>;
     /// What the kernel counted for a running attempt.

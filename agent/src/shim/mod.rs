@@ -18,7 +18,7 @@
 
 mod guard;
 mod output;
-mod start;
+pub(crate) mod start;
 mod watch;
 
 use std::collections::BTreeMap;
@@ -171,7 +171,7 @@ pub(crate) fn user_ids(user: &str) -> Option<(u32, u32)> {
 }
 
 /// Variables that are in no file. Afterwards they are nowhere but in the program's environment.
-fn take_variables() -> Result<BTreeMap<String, String>, StartError> {
+fn take_variables() -> Result<BTreeMap<OsString, OsString>, StartError> {
     let failed = |source| StartError::Step { step: "read its variables", source };
     let mut text = Vec::new();
     std::io::stdin().read_to_end(&mut text).map_err(failed)?;
@@ -180,8 +180,9 @@ fn take_variables() -> Result<BTreeMap<String, String>, StartError> {
     }
     let null = File::open("/dev/null").map_err(failed)?;
     rustix::stdio::dup2_stdin(null).map_err(|errno| failed(errno.into()))?;
-    serde_json::from_slice(&text)
-        .map_err(|_| StartError::Order("its variables cannot be read".to_owned()))
+    let given: BTreeMap<String, String> = serde_json::from_slice(&text)
+        .map_err(|_| StartError::Order("its variables cannot be read".to_owned()))?;
+    Ok(given.into_iter().map(|(name, value)| (name.into(), value.into())).collect())
 }
 
 fn remove_group(order: &Order) {

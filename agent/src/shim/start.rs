@@ -1,10 +1,11 @@
 //! From fork to exec.
 //!
 //! Order in the child: enter the group (while it still has the rights to), new session, user,
-//! directory, exec. The program is in its group before its first instruction.
+//! directory, exec. The program is in its group before its first instruction. A check of a running task (see
+//! [`crate::runtime::process`]) goes the same way, so that it finds what the task's program finds.
 
 use std::collections::BTreeMap;
-use std::ffi::CString;
+use std::ffi::{CString, OsString};
 use std::fmt;
 use std::io;
 use std::os::fd::{AsRawFd, OwnedFd, RawFd};
@@ -29,7 +30,7 @@ pub(super) struct Started {
 
 /// Why the program does not run.
 #[derive(Debug)]
-pub(super) enum StartError {
+pub(crate) enum StartError {
     /// The order cannot be carried out at all.
     Order(String),
     /// The kernel refused a step.
@@ -47,7 +48,7 @@ impl fmt::Display for StartError {
 }
 
 /// Steps in the child, told to the parent by number.
-const STEPS: [&str; 7] = [
+const STEPS: [&str; 8] = [
     "execute",
     "enter its control group",
     "make its session",
@@ -55,6 +56,7 @@ const STEPS: [&str; 7] = [
     "become its user",
     "enter its working directory",
     "reset its signals",
+    "tie it to the agent",
 ];
 
 #[derive(Debug)]
@@ -67,9 +69,29 @@ struct Identity {
 
 pub(super) fn start(
     order: &Order,
-    given: &BTreeMap<String, String>,
+    given: &BTreeMap<OsString, OsString>,
 ) -> Result<Started, StartError> {
-    let Program::Process { argv, working_dir, user } = &order.launch.program else {
+    let Program::Process { argv, .. } = &order.launch.program else {
+        return Err(StartError::Order("the order is for a container".to_owned()));
+    };
+    let pipe = || {
+        rustix::pipe::pipe_with(PipeFlags::CLOEXEC)
+            .map_err(|source| StartError::Step { step: "make its pipes", source: source.into() })
+    };
+    let ((stdout, child_stdout), (stderr, child_stderr)) = (pipe()?, pipe()?);
+    let child = spawn((order, given), argv, (child_stdout, child_stderr), false)?;
+    Ok(Started { pid: child.id().cast_signed(), stdout, stderr })
+}
+
+/// Starts `argv` where and as whom the order's own program was started, with these as its output. `given`: variables that
+/// are not in the order. `tied`: it is killed when the thread that called this ends.
+pub(crate) fn spawn(
+    (order, given): (&Order, &BTreeMap<OsString, OsString>),
+    argv: &[String],
+    (stdout, stderr): (OwnedFd, OwnedFd),
+    tied: bool,
+) -> Result<std::process::Child, StartError> {
+    let Program::Process { working_dir, user, .. } = &order.launch.program else {
         return Err(StartError::Order("the order is for a container".to_owned()));
     };
     let Some((program, args)) = argv.split_first() else {
@@ -85,9 +107,8 @@ pub(super) fn start(
             .map_err(|source| StartError::Step { step: "open its control group", source })?,
         None => Vec::new(),
     };
-    let pipe = || rustix::pipe::pipe_with(PipeFlags::CLOEXEC).map_err(system("make its pipes"));
-    let ((stdout, child_stdout), (stderr, child_stderr), (step_read, step_write)) =
-        (pipe()?, pipe()?, pipe()?);
+    let (step_read, step_write) =
+        rustix::pipe::pipe_with(PipeFlags::CLOEXEC).map_err(system("make its pipes"))?;
 
     let mut command = Command::new(program);
     command.args(args).env_clear();
@@ -104,22 +125,20 @@ pub(super) fn start(
     if let Some((name, value)) = mark(&order.launch.id).split_once('=') {
         command.env(name, value);
     }
-    command.stdin(Stdio::null()).stdout(child_stdout).stderr(child_stderr);
+    command.stdin(Stdio::null()).stdout(stdout).stderr(stderr);
     let child = Child {
         entrances: entrances.iter().map(AsRawFd::as_raw_fd).collect(),
         identity,
         dir: CString::new(dir.as_os_str().as_encoded_bytes())
             .map_err(|_| StartError::Order("the working directory holds a zero byte".to_owned()))?,
         step: step_write.as_raw_fd(),
+        tied_to: tied.then(std::process::id).map(u32::cast_signed),
     };
     // SAFETY: `Child::enter` makes only async-signal-safe system calls on memory made above.
     unsafe { command.pre_exec(move || child.enter()) };
     let spawned = command.spawn();
     drop((command, step_write, entrances));
-    match spawned {
-        Ok(child) => Ok(Started { pid: child.id().cast_signed(), stdout, stderr }),
-        Err(source) => Err(failed_step(&step_read, program, &dir, source)),
-    }
+    spawned.map_err(|source| failed_step(&step_read, program, &dir, source))
 }
 
 fn failed_step(
@@ -147,6 +166,8 @@ struct Child {
     identity: Option<Identity>,
     dir: CString,
     step: RawFd,
+    /// The process whose end is its end.
+    tied_to: Option<i32>,
 }
 
 impl Child {
@@ -158,6 +179,7 @@ impl Child {
             Child::become_user,
             Child::enter_dir,
             Child::reset_signals,
+            Child::tie,
         ]) {
             if !done(self) {
                 let error = io::Error::last_os_error();
@@ -197,6 +219,15 @@ impl Child {
     fn enter_dir(&self) -> bool {
         // SAFETY: a text that ends in zero, made before the fork.
         unsafe { libc::chdir(self.dir.as_ptr()) == 0 }
+    }
+
+    /// After the change of user, which would undo it.
+    fn tie(&self) -> bool {
+        let Some(parent) = self.tied_to else { return true };
+        // SAFETY: numbers only. A parent that was gone before the call is seen by the second.
+        unsafe {
+            libc::prctl(libc::PR_SET_PDEATHSIG, libc::SIGKILL) == 0 && libc::getppid() == parent
+        }
     }
 }
 

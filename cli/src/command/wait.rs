@@ -25,7 +25,8 @@ pub(crate) struct Args {
     /// KIND NAME…, KIND/NAME…, or KIND with -l or --all
     #[arg(value_name = "OBJECT", required = true)]
     objects: Vec<String>,
-    /// phase=PHASE, condition=NAME[=STATUS], jsonpath={.PATH}[=VALUE], or delete
+    /// phase=PHASE, condition=NAME[=STATUS], jsonpath={.PATH}[=VALUE], or delete; a task is Ready when it runs and its
+    /// readiness probe, if it has one, succeeds
     #[arg(long, value_name = "WHAT")]
     r#for: Wanted,
     /// How long at most
@@ -144,9 +145,14 @@ fn steps(path: &str) -> Result<Vec<Step>, String> {
 }
 
 impl Wanted {
-    fn holds(&self, object: &Value) -> bool {
+    fn holds(&self, info: &KindInfo, object: &Value) -> bool {
         match self {
             Wanted::Delete => false,
+            Wanted::Condition { r#type, status } if info.kind == "Task" => {
+                // A task has no list of conditions; the one that it has is in its status.
+                let is = if is_ready(object) { "True" } else { "False" };
+                r#type.eq_ignore_ascii_case(READY) && status.eq_ignore_ascii_case(is)
+            }
             Wanted::Phase(phase) => {
                 object.pointer("/status/phase").is_some_and(|p| p == phase.as_str())
             }
@@ -180,7 +186,8 @@ impl Wanted {
     fn is_hopeless(&self, info: &KindInfo, object: &Value) -> bool {
         let ended =
             object.pointer("/status/phase").is_some_and(|p| p == "Succeeded" || p == "Failed");
-        info.kind == "Task" && ended && matches!(self, Wanted::Phase(_)) && !self.holds(object)
+        let needs_life = matches!(self, Wanted::Phase(_) | Wanted::Condition { .. });
+        info.kind == "Task" && ended && needs_life && !self.holds(info, object)
     }
 
     fn text(&self) -> String {
@@ -191,6 +198,15 @@ impl Wanted {
             Wanted::JsonPath { text, .. } => format!("at {text}"),
         }
     }
+}
+
+/// The condition that every task has.
+const READY: &str = "Ready";
+
+/// Whether a task serves: it runs, and its probes, if it has some, say so.
+fn is_ready(object: &Value) -> bool {
+    let runs = object.pointer("/status/phase").is_some_and(|p| p == "Running");
+    runs && object.pointer("/status/ready").is_none_or(|r| r != false)
 }
 
 pub(crate) async fn run(args: Args, session: &mut Session) -> Outcome {
@@ -270,7 +286,7 @@ async fn until_holds(args: &Args, objects: Vec<Doomed>, session: &mut Session) -
             progress.end(false);
             return Err(ended(&title, &object, gone, wanted));
         }
-        if wanted.holds(&object) {
+        if wanted.holds(awaited.info, &object) {
             progress.drop_row(uid);
             left.remove(uid);
             session.ui.line(&format!("{title} is {}", wanted.text()))?;
@@ -360,7 +376,8 @@ mod tests {
     fn paths_and_conditions_are_looked_up() {
         let object = json!({"status": {"phase": "Running", "free": {"cpu": 2},
             "conditions": [{"type": "Ready", "status": "False"}]}});
-        let holds = |text: &str| text.parse::<Wanted>().expect(text).holds(&object);
+        let node = muster_api::kind::find_by_word("node").expect("served");
+        let holds = |text: &str| text.parse::<Wanted>().expect(text).holds(node, &object);
         assert!(holds("jsonpath={.status.phase}=Running"));
         assert!(holds("jsonpath={.status.free.cpu}=2"));
         assert!(holds("jsonpath={.status.free}"));
@@ -392,6 +409,27 @@ mod tests {
             .expect_err("it failed");
         assert_eq!(error.class().exit(), exit::TASK_ENDED);
         assert!(error.to_string().contains("ended as Failed"), "{error}");
+    }
+
+    #[test]
+    fn a_task_is_ready_when_it_runs_and_its_probes_say_so() {
+        let task = muster_api::kind::find_by_word("task").expect("served");
+        let holds = |text: &str, status: &Value| {
+            text.parse::<Wanted>().expect(text).holds(task, &json!({"status": status}))
+        };
+        for (status, ready) in [
+            (json!({"phase": "Running"}), true),
+            (json!({"phase": "Running", "ready": true}), true),
+            (json!({"phase": "Running", "ready": false}), false),
+            (json!({"phase": "Starting", "ready": false}), false),
+            (json!({"phase": "Bound"}), false),
+        ] {
+            assert_eq!(holds("condition=Ready", &status), ready, "{status}");
+            assert_eq!(holds("condition=ready=false", &status), !ready, "{status}");
+            assert!(!holds("condition=Available", &status), "a task has none of that name");
+        }
+        let ended = json!({"status": {"phase": "Failed"}});
+        assert!("condition=Ready".parse::<Wanted>().expect("good").is_hopeless(task, &ended));
     }
 
     #[tokio::test]

@@ -121,6 +121,8 @@ async fn mark_once(
             }
             status.message = format!("node {node} cannot be reached; it was {}", status.phase);
             status.phase = TaskPhase::Unknown;
+            // `ready_at` stays: it is ready again when it is heard again and says so.
+            status.ready = status.ready.map(|_| false);
             status.reason = "NodeSilent".to_owned();
             Some(vec![objects::replace(stored, &task)])
         })

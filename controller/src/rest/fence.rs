@@ -157,6 +157,7 @@ fn end(context: &Context, stored: &Stored, task: &mut Task, word: &Word<'_>) -> 
     );
     status.phase = TaskPhase::Failed;
     status.reason = REASON.to_owned();
+    status.set_ready(status.ready, MicroTime(context.clock.now()));
     status.finished_at = Some(MicroTime(context.clock.now()));
     let mut ops = vec![objects::replace(stored, task)];
     ops.extend(lease.and_then(|l| objects::release_lease(&context.store, &l.name, &stored.uid)));

@@ -5,7 +5,8 @@
 //! end of its lease are one transaction: the agent says "ended" only after the kernel showed that no
 //! process is left (invariant 1).
 
-use muster_api::kind::task::{Task, TaskStatus};
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::MicroTime;
+use muster_api::kind::task::{LIVENESS_FAILED, NOT_READY, STARTUP_FAILED, Task, TaskStatus};
 use muster_api::name::NodeName;
 use muster_api::phase::TaskPhase;
 use muster_api::wire::WireError;
@@ -60,7 +61,7 @@ pub(crate) async fn apply(
         if *stored.uid != *report.uid || !is_news(status, phase, report.sequence) {
             return None;
         }
-        let before = status.phase;
+        let before = status.clone();
         status.phase = phase;
         status.attempt = report.attempt;
         status.exit_code = report.exit_code;
@@ -70,6 +71,7 @@ pub(crate) async fn apply(
         status.started_at.clone_from(&started);
         status.finished_at.clone_from(&finished);
         status.report_sequence = report.sequence;
+        status.set_ready(report.ready, MicroTime(context.clock.now()));
         // One that was finished, or failed, before the order came to it has an end of its own.
         let by_order = phase.is_terminal() && report.reason == STOPPED;
         if let Some(stop) = status.stop.clone().filter(|_| by_order) {
@@ -86,7 +88,7 @@ pub(crate) async fn apply(
     })
     .await?;
     if let Some((before, task)) = told {
-        tell(context, before, &task);
+        tell(context, &before, &task);
     }
     Ok(())
 }
@@ -101,15 +103,16 @@ fn is_news(status: &TaskStatus, phase: TaskPhase, sequence: u64) -> bool {
 }
 
 /// Puts what a person should see into an Event.
-fn tell(context: &Context, before: TaskPhase, task: &Task) {
+fn tell(context: &Context, before: &TaskStatus, task: &Task) {
     let Some(status) = &task.status else { return };
+    tell_probes(context, before, status, task);
     let message = if status.message.is_empty() {
         format!("{}", status.phase)
     } else {
         status.message.clone()
     };
     match status.phase {
-        TaskPhase::Running if before != TaskPhase::Running => {
+        TaskPhase::Running if before.phase != TaskPhase::Running => {
             context.events.task(task, "Started", format!("attempt {} runs", status.attempt));
         }
         TaskPhase::Succeeded => context.events.task(task, "Completed", message),
@@ -118,6 +121,27 @@ fn tell(context: &Context, before: TaskPhase, task: &Task) {
         }
         TaskPhase::Starting if status.attempt > 1 => {
             context.events.warn_task(task, "Restarting", message)
+        }
+        _ => {}
+    }
+}
+
+/// What its probes say that they did not say before.
+fn tell_probes(context: &Context, before: &TaskStatus, status: &TaskStatus, task: &Task) {
+    let events = &context.events;
+    let is_news = |reason: &str| status.reason == reason && before.reason != reason;
+    if is_news(LIVENESS_FAILED) {
+        events.warn_task(task, LIVENESS_FAILED, status.message.clone());
+    } else if is_news(STARTUP_FAILED) {
+        events.warn_task(task, STARTUP_FAILED, status.message.clone());
+    }
+    match (status.ready, before.ready) {
+        (Some(true), Some(false) | None) => {
+            events.task(task, "Ready", format!("attempt {} is ready", status.attempt));
+        }
+        // One that ends is not ready either, and its end is told.
+        (Some(false), Some(true)) if status.phase == TaskPhase::Running => {
+            events.warn_task(task, NOT_READY, status.message.clone());
         }
         _ => {}
     }

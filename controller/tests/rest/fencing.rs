@@ -1,6 +1,7 @@
 //! Nodes that are lost: a person's word, what comes back after all, and what a deletion takes along.
 
 use muster_api::wire::agent::v1::TaskPhase::{Failed, Running};
+use muster_api::wire::agent::v1::TaskReport;
 use serde_json::{Value, json};
 
 use super::agent::{Credential, Session, ask_to_join, join, report, token};
@@ -30,13 +31,15 @@ async fn lost_robot(cluster: &Cluster) -> (Credential, String) {
     let (_, made) = send(&admin, "POST", TASKS, driver("first")).await;
     let uid = made["metadata"]["uid"].as_str().unwrap().to_owned();
     assert_eq!(session.assigned(&uid).await.lease.unwrap().epoch, 1);
-    session.say(report(&uid, 2, Running)).await;
-    cluster.until(&format!("{TASKS}/first"), |t| t["status"]["phase"] == "Running").await;
+    session.say(TaskReport { ready: Some(true), ..report(&uid, 2, Running) }).await;
+    let runs = |t: &Value| t["status"]["phase"] == "Running" && t["status"]["ready"] == true;
+    cluster.until(&format!("{TASKS}/first"), runs).await;
     let early = send(&admin, "POST", &format!("{NODE}/fence"), json!({"reason": "I think"})).await;
     assert_eq!(refusal(&early), (409, "NodeAlive"));
     drop(session);
     cluster.until(NODE, |node| condition(node, "Ready").0 == "Unknown").await;
-    cluster.until(&format!("{TASKS}/first"), |t| t["status"]["phase"] == "Unknown").await;
+    let lost = |t: &Value| t["status"]["phase"] == "Unknown" && t["status"]["ready"] == false;
+    cluster.until(&format!("{TASKS}/first"), lost).await;
     (credential, uid)
 }
 
@@ -58,6 +61,7 @@ async fn a_fence_ends_what_was_there_and_a_stray_keeps_the_node_until_it_ended()
         (&ended["status"]["phase"], &ended["status"]["reason"]),
         (&"Failed".into(), &"NodeFenced".into())
     );
+    assert_eq!(ended["status"]["ready"], false);
     let message = ended["status"]["message"].as_str().unwrap();
     assert!(message.contains("ada") && message.contains("plug pulled"), "{message}");
     let (_, lease) = get(&admin, &format!("{G}/leases/r1.body")).await;

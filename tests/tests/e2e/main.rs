@@ -10,6 +10,7 @@ mod frameworks;
 mod lease;
 mod poses;
 mod preemption;
+mod probes;
 mod quotas;
 mod survival;
 mod tasksets;

@@ -6,6 +6,7 @@
 //! | [`engine`] | the connection, the stream of events, whether the engine is there |
 //! | [`create`] | a launch as the engine wants it |
 //! | [`inspect`] | what the engine says of a container, as the core wants it |
+//! | [`exec`] | programs inside a running container: its checks |
 //! | [`guard`] | the process that ends a container when the agent cannot |
 //!
 //! Level-triggered: an event only says which container to look at; after every reconnection each is
@@ -13,6 +14,7 @@
 
 mod create;
 mod engine;
+mod exec;
 mod guard;
 mod inspect;
 
@@ -39,12 +41,13 @@ use tokio::sync::Notify;
 use super::cgroup::group::Group;
 use super::process::{KEPT_ATTEMPTS, Reexec};
 use super::{
-    AttemptId, Launch, Launched, Limits, LogQuery, Runtime, RuntimeError, RuntimeStatus, Used,
+    AttemptId, Executed, Launch, Launched, Limits, LogQuery, Reached, Runtime, RuntimeError,
+    RuntimeStatus, Used,
 };
 use crate::clock;
 use crate::driver::chain;
 use crate::given::files::Place;
-use crate::runtime::launch::{Container, Program, Pull};
+use crate::runtime::launch::{Container, Network, Program, Pull};
 use engine::Engine;
 use inspect::Seen;
 
@@ -457,6 +460,29 @@ impl Runtime for DockerRuntime {
             let (docker, name) = (self.client()?, self.name(id));
             let update = docker.update_container(&name, create::update(limits));
             update.await.map_err(|error| RuntimeError::new("change a container's limits", error))
+        }
+        .boxed()
+    }
+
+    fn exec<'a>(
+        &'a self,
+        launch: &'a Launch,
+        argv: &'a [String],
+        until: BoxFuture<'a, ()>,
+    ) -> BoxFuture<'a, Result<Executed, RuntimeError>> {
+        async move {
+            let docker = self.client()?;
+            exec::exec(&docker, &self.name(&launch.id), argv, until).await
+        }
+        .boxed()
+    }
+
+    fn network<'a>(&'a self, launch: &'a Launch) -> BoxFuture<'a, Result<Reached, RuntimeError>> {
+        async move {
+            if matches!(&launch.program, Program::Container(c) if c.network == Network::Host) {
+                return Ok(Reached::Here);
+            }
+            exec::network(&self.client()?, &self.name(&launch.id)).await
         }
         .boxed()
     }

@@ -13,9 +13,11 @@
 //! | [`spawn`] | directory, group, lock, shim |
 //! | [`adopt`] | what became of the attempts of an earlier life of the agent |
 //! | [`scan`] | facts from `/proc` |
+//! | [`exec`] | programs beside a running attempt: its checks |
 
 mod adopt;
 pub(crate) mod attempt;
+mod exec;
 pub(crate) mod reach;
 pub(crate) mod scan;
 mod spawn;
@@ -45,7 +47,7 @@ use tokio::io::unix::AsyncFd;
 
 use super::cgroup::{Enforcer, Kernel};
 use super::launch::{AttemptId, Launch, Limits, Used};
-use super::{Launched, LogQuery, Runtime, RuntimeError, RuntimeStatus, logs};
+use super::{Executed, Launched, LogQuery, Runtime, RuntimeError, RuntimeStatus, logs};
 use crate::clock;
 use crate::durable::FileError;
 use crate::given::files::Place;
@@ -409,6 +411,15 @@ impl Runtime for ProcessRuntime {
             }
         }
         .boxed()
+    }
+
+    fn exec<'a>(
+        &'a self,
+        launch: &'a Launch,
+        argv: &'a [String],
+        until: BoxFuture<'a, ()>,
+    ) -> BoxFuture<'a, Result<Executed, RuntimeError>> {
+        exec::exec(self.0.dir(&launch.id), argv, until).boxed()
     }
 
     fn remove<'a>(&'a self, uid: &'a TaskUid) -> BoxFuture<'a, Result<(), RuntimeError>> {

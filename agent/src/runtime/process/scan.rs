@@ -1,7 +1,9 @@
 //! Facts from `/proc`.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::ffi::OsString;
 use std::fs;
+use std::os::unix::ffi::OsStringExt as _;
 
 use super::attempt::Process;
 
@@ -78,6 +80,20 @@ pub(crate) fn tree(shim: i32, session: Option<i32>, mark: &str) -> BTreeSet<i32>
 fn marked(pid: i32, mark: &str) -> bool {
     let environ = fs::read(format!("/proc/{pid}/environ")).unwrap_or_default();
     environ.split(|byte| *byte == 0).any(|variable| variable == mark.as_bytes())
+}
+
+/// The environment that a process was started with; nothing of one that has ended.
+pub(crate) fn variables(process: Process) -> BTreeMap<OsString, OsString> {
+    let environ = fs::read(format!("/proc/{}/environ", process.pid)).unwrap_or_default();
+    if !is_alive(process) {
+        return BTreeMap::new();
+    }
+    let variables = environ.split(|byte| *byte == 0).filter_map(|variable| {
+        let middle = variable.iter().position(|byte| *byte == b'=')?;
+        let text = |bytes: &[u8]| OsString::from_vec(bytes.to_vec());
+        Some((text(&variable[..middle]), text(&variable[middle + 1..])))
+    });
+    variables.collect()
 }
 
 /// Cpu time (µs) and resident memory of living processes.

@@ -1,6 +1,7 @@
 //! Task: one run of one program on one node, the unit that is placed.
 
 pub mod config;
+pub mod probe;
 pub(super) mod rules;
 #[cfg(test)]
 mod tests;
@@ -54,6 +55,16 @@ pub struct TaskSpec {
     /// The program.
     #[serde(default)]
     pub run: Run,
+    /// Tells whether it can serve: it is Ready while this succeeds. None: it is Ready when it runs.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub readiness: Option<probe::Probe>,
+    /// Tells whether it is alive: when this fails, the attempt is ended and counts as a failure for `restartPolicy`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub liveness: Option<probe::Probe>,
+    /// Tells whether it has started: until this has succeeded once it is not Ready and the other probes are not made;
+    /// when this fails, the attempt is ended as by `liveness`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub startup: Option<probe::Probe>,
     /// What happens when the program ends.
     #[serde(default)]
     pub restart_policy: RestartPolicy,
@@ -488,9 +499,12 @@ pub struct TaskStatus {
     /// The lease that came with the placement.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub lease: Option<TaskLease>,
-    /// Whether its readiness probe says that it can serve; none: it has no probe.
+    /// Whether its start-up and readiness probes say that it can serve, true only while it runs; none: it has neither.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub ready: Option<bool>,
+    /// Since when `ready` is true, by the controller's clock.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub ready_at: Option<MicroTime>,
     /// Number of the current attempt; 1 is the first, 0: none yet.
     pub attempt: u32,
     /// How the last attempt that ended ended.
@@ -531,6 +545,23 @@ pub struct TaskStatus {
     pub report_sequence: u64,
 }
 
+impl TaskStatus {
+    /// Whether the task serves: it runs, and its probes, if it has some, say so.
+    #[must_use]
+    pub fn is_ready(&self) -> bool {
+        self.phase == TaskPhase::Running && self.ready != Some(false)
+    }
+
+    /// Takes what its node says of its probes, in the phase that it has now.
+    pub fn set_ready(&mut self, ready: Option<bool>, now: MicroTime) {
+        self.ready = ready.map(|ready| ready && self.phase == TaskPhase::Running);
+        match self.ready {
+            Some(true) => drop(self.ready_at.get_or_insert(now)),
+            Some(false) | None => self.ready_at = None,
+        }
+    }
+}
+
 #[expect(clippy::trivially_copy_pass_by_ref, reason = "serde passes references")]
 fn is_zero(n: &u64) -> bool {
     *n == 0
@@ -556,6 +587,14 @@ pub const PREEMPTED: &str = "Preempted";
 pub const NODE_MAINTENANCE: &str = "NodeMaintenance";
 /// Reason of a task whose `activeDeadlineSeconds` have passed.
 pub const DEADLINE_EXCEEDED: &str = "DeadlineExceeded";
+/// Reason of a running task whose start-up probe has not succeeded yet.
+pub const STARTING_UP: &str = "StartingUp";
+/// Reason of a running task whose readiness probe does not succeed.
+pub const NOT_READY: &str = "NotReady";
+/// Reason of an attempt that is or was ended because its liveness probe failed.
+pub const LIVENESS_FAILED: &str = "LivenessFailed";
+/// Reason of an attempt that is or was ended because its start-up probe failed.
+pub const STARTUP_FAILED: &str = "StartupFailed";
 
 /// The lease that a task holds.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]

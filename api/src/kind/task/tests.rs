@@ -139,3 +139,41 @@ fn classes_are_written_as_in_the_paper() {
     assert_eq!(class(json!({"sensors": ["k:I"]})), "SR");
     assert_eq!(class(json!({})), "none");
 }
+
+#[test]
+fn probes_get_their_defaults_and_do_not_change() {
+    let probed = sleep(json!({"readiness": {"tcp": {"port": 80}}}));
+    let admitted = admit(&probed).expect("good");
+    assert_eq!(
+        admitted["spec"]["readiness"],
+        json!({
+            "tcp": {"port": 80}, "initialDelay": "0s", "period": "10s", "timeout": "1s",
+            "successThreshold": 1, "failureThreshold": 3,
+        })
+    );
+    let mut changed = admitted.clone();
+    changed["spec"]["readiness"]["period"] = "5s".into();
+    let info = find(crate::API_VERSION, "Task").expect("served");
+    let refused = admit_change(info, &admitted, &changed).expect_err("it cannot change");
+    let paths: Vec<&str> = refused.iter().map(|v| v.path.as_str()).collect();
+    assert_eq!(paths, ["spec.readiness.period"]);
+}
+
+#[test]
+fn only_what_runs_is_ready() {
+    let time =
+        |second| MicroTime(k8s_openapi::jiff::Timestamp::from_second(second).expect("in range"));
+    let mut status = TaskStatus { phase: TaskPhase::Running, ..TaskStatus::default() };
+    assert!(status.is_ready(), "it has no probe");
+    status.set_ready(Some(false), time(1));
+    assert!(!status.is_ready() && status.ready_at.is_none());
+    status.set_ready(Some(true), time(2));
+    status.set_ready(Some(true), time(3));
+    assert!(status.is_ready());
+    assert_eq!(status.ready_at, Some(time(2)), "since it became so");
+    status.phase = TaskPhase::Stopping;
+    status.set_ready(Some(true), time(4));
+    assert_eq!((status.ready, status.ready_at.clone()), (Some(false), None));
+    status.set_ready(None, time(5));
+    assert_eq!(status.ready, None);
+}

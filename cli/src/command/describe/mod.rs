@@ -6,6 +6,7 @@ mod framework;
 mod keyed;
 mod lease;
 mod node;
+mod probes;
 mod quota;
 mod task;
 mod taskset;

@@ -11,6 +11,7 @@ use crate::command::why::refusal_table;
 use crate::output::columns::task as columns;
 use crate::output::human;
 use crate::output::sheet::Sheet;
+use crate::output::style::Mood;
 use crate::output::table::Cell;
 
 pub(super) fn describe(sheet: &mut Sheet, task: &Task, now: Timestamp) {
@@ -20,6 +21,7 @@ pub(super) fn describe(sheet: &mut Sheet, task: &Task, now: Timestamp) {
     placement(sheet, &task.spec.placement);
     resources(sheet, &task.spec.resources, &status);
     program(sheet, &task.spec);
+    super::probes::describe(sheet, &task.spec, &status);
     if !status.why.is_empty() {
         sheet.table("Why it waits", refusal_table(&status.why));
     }
@@ -45,9 +47,16 @@ fn state(sheet: &mut Sheet, task: &Task, status: &TaskStatus, now: Timestamp) {
         sheet.field("Attempt", status.attempt.to_string());
     }
     sheet.maybe("Placed", status.bound_at.as_ref().map(|t| when(t.0, now)));
+    sheet.maybe("Ready", ready(status));
     sheet.maybe("Started", status.started_at.as_ref().map(|t| when(t.0, now)));
     sheet.maybe("Ended", status.finished_at.as_ref().map(|t| when(t.0, now)));
     sheet.maybe("Exit", some(&columns::exit(status)));
+}
+
+/// Of a running task: whether it serves.
+fn ready(status: &TaskStatus) -> Option<Cell> {
+    let word = columns::ready(status)?;
+    Some(Cell::new(word, if status.is_ready() { Mood::Good } else { Mood::Warn }))
 }
 
 fn placement(sheet: &mut Sheet, placement: &Placement) {
@@ -185,7 +194,7 @@ fn optional(optional: bool) -> &'static str {
 }
 
 /// The words of a command; those that a shell would split are quoted, so that it is seen where each ends.
-fn command_line(words: &[String]) -> String {
+pub(super) fn command_line(words: &[String]) -> String {
     let plain = |w: &str| {
         !w.is_empty() && w.chars().all(|c| c.is_ascii_alphanumeric() || "-_./=:,@%+".contains(c))
     };

@@ -20,6 +20,7 @@ pub(super) const COLUMNS: &[Column<Task>] = &[
     }),
     Column::new("AGE", |task, now| age(task.metadata.creation_timestamp.as_ref(), now)),
     Column::new("REASON", |task, _| status(task, reason)),
+    Column::wide("READY", |task, _| status(task, |s| ready(s).unwrap_or_default().to_owned())),
     Column::wide("EPOCH", |task, _| {
         status(task, |s| s.lease.as_ref().map(|l| l.epoch.to_string()).unwrap_or_default())
     }),
@@ -43,6 +44,12 @@ pub(crate) fn mood(phase: TaskPhase) -> Mood {
             Mood::Warn
         }
     }
+}
+
+/// Whether a running task serves; of others nothing is said.
+pub(crate) fn ready(status: &TaskStatus) -> Option<&'static str> {
+    let runs = status.phase == TaskPhase::Running;
+    runs.then(|| if status.is_ready() { "True" } else { "False" })
 }
 
 fn phase(task: &Task) -> Cell {
@@ -172,17 +179,17 @@ mod tests {
     }
 
     #[test]
-    fn the_wide_table_adds_lease_usage_and_end() {
+    fn the_wide_table_adds_readiness_lease_usage_and_end() {
         let text = text(true, false);
         let squeezed: Vec<String> =
             text.lines().map(|l| l.split_whitespace().collect::<Vec<_>>().join(" ")).collect();
         assert_eq!(
             squeezed[1],
-            "gmapping Running r1 2.35m AR-CR-SR 1 5m - 4 0.153/0.5 12Mi/64Mi - -"
+            "gmapping Running r1 2.35m AR-CR-SR 1 5m - True 4 0.153/0.5 12Mi/64Mi - -"
         );
         assert_eq!(
             squeezed[3],
-            "crash Failed c1 - none 3 5m OOMKilled - - - signal 9 out of memory"
+            "crash Failed c1 - none 3 5m OOMKilled - - - - signal 9 out of memory"
         );
     }
 

@@ -1,6 +1,6 @@
 //! Whether a task is ready, available, or has failed its template. The one place that probes plug into.
 //!
-//! A task is *ready* when it runs and its probe, if it has one, says so; *available* when it has run for
+//! A task is *ready* when it runs and its probes, if it has some, say so; *available* when it has been that for
 //! `minReadySeconds` as well. The time it runs is by its node's clock, so a clock that is ahead makes it available late;
 //! with `minReadySeconds: 0` no clock is looked at.
 
@@ -34,7 +34,9 @@ pub fn health(task: &TaskView, min_ready: Duration, now: Timestamp) -> Health {
     if task.phase != TaskPhase::Running || task.ready == Some(false) {
         return Health::NotReady;
     }
-    let available_at = after(task.started.unwrap_or(task.created), min_ready);
+    let runs_since = task.started.unwrap_or(task.created);
+    let since = task.ready_since.map_or(runs_since, |ready| ready.max(runs_since));
+    let available_at = after(since, min_ready);
     if min_ready.is_zero() || available_at <= now {
         Health::Available
     } else {
@@ -50,10 +52,12 @@ pub enum Fault {
         /// What its node says about it.
         message: String,
     },
-    /// It runs, and its probe did not say that it is ready in time.
+    /// It runs, and its probes did not say that it is ready in time.
     ProbeFailed {
         /// How long it had, seconds.
         deadline: u64,
+        /// What the probe said.
+        message: String,
     },
     /// It did not get as far as running in time.
     DeadlineExceeded {
@@ -83,8 +87,9 @@ impl fmt::Display for Fault {
         match self {
             Fault::Crashed { message } if message.is_empty() => f.write_str("ended by itself"),
             Fault::Crashed { message } => write!(f, "crashed: {message}"),
-            Fault::ProbeFailed { deadline } => {
-                write!(f, "ran and was not ready within {deadline} s")
+            Fault::ProbeFailed { deadline, message } => {
+                write!(f, "ran and was not ready within {deadline} s")?;
+                if message.is_empty() { Ok(()) } else { write!(f, ": {message}") }
             }
             Fault::DeadlineExceeded { deadline, phase, message } => {
                 write!(f, "was still {phase} after {deadline} s")?;
@@ -132,7 +137,9 @@ pub fn fault(
     }
     let deadline = deadline.as_secs();
     match task.phase {
-        Running if task.ready == Some(false) => Some(Fault::ProbeFailed { deadline }),
+        Running if task.ready == Some(false) => {
+            Some(Fault::ProbeFailed { deadline, message: task.message.clone() })
+        }
         // It may be young: its node was away for long.
         Running => None,
         phase => Some(Fault::DeadlineExceeded { deadline, phase, message: task.message.clone() }),

@@ -57,8 +57,10 @@ pub struct TaskView {
     pub attempt: u32,
     /// An attempt of it has ended by itself, with a code or by a signal.
     pub exited: bool,
-    /// What its readiness probe says.
+    /// What its start-up and readiness probes say; none: it has neither.
     pub ready: Option<bool>,
+    /// Since when they say that it is ready, by the controller's clock.
+    pub ready_since: Option<Timestamp>,
     /// It is being deleted.
     pub ending: bool,
     /// Why it is in its phase.
@@ -103,6 +105,7 @@ impl TaskView {
             attempt: status.attempt,
             exited: status.exit_code.is_some() || status.signal.is_some(),
             ready: status.ready,
+            ready_since: status.ready_at.map(|t| t.0),
             ending: task.metadata.deletion_timestamp.is_some(),
             reason: status.reason,
             message: status.message,

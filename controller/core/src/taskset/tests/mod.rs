@@ -3,10 +3,13 @@
 mod model;
 mod world;
 
+use std::time::Duration;
+
 use muster_api::condition::ConditionStatus;
 use muster_api::phase::TaskPhase;
 use serde_json::json;
 
+use super::health::{Health, health};
 use super::view::Claim;
 use super::{Action, Ending, NewTask, Place};
 use world::World;
@@ -143,11 +146,33 @@ fn a_probe_that_never_says_ready_ends_the_rollout_at_the_deadline() {
     world.set_template(1);
     world.steps(4);
     world.task("set-0").ready = Some(false);
+    "its readiness probe failed: HTTP status 503".clone_into(&mut world.task("set-0").message);
     world.steps(4);
     assert_eq!(world.templates(), ["1", "0", "0"], "it has time");
     world.settle();
     assert_eq!(world.templates(), ["0", "0", "0"]);
-    assert_eq!(world.status.rolled_back_from.as_ref().expect("given up").reason, "ProbeFailed");
+    let why = world.status.rolled_back_from.as_ref().expect("given up");
+    assert_eq!(why.reason, "ProbeFailed");
+    let said = "was not ready within 30 s: its readiness probe failed: HTTP status 503";
+    assert!(why.message.ends_with(said), "{}", why.message);
+}
+
+#[test]
+fn a_task_is_available_when_it_has_been_ready_for_long_enough() {
+    let mut world = three();
+    let (now, min_ready) = (world.now, Duration::from_secs(5));
+    let ago = |seconds| now - jiff::SignedDuration::from_secs(seconds);
+    let task = world.task("set-0");
+    task.started = Some(ago(100));
+    assert_eq!(health(task, min_ready, now), Health::Available, "it has no probe");
+    (task.ready, task.ready_since) = (Some(true), Some(ago(3)));
+    let available_at = now + jiff::SignedDuration::from_secs(2);
+    assert_eq!(health(task, min_ready, now), Health::Ready { available_at });
+    assert_eq!(health(task, Duration::ZERO, now), Health::Available);
+    task.ready_since = Some(ago(5));
+    assert_eq!(health(task, min_ready, now), Health::Available);
+    task.ready = Some(false);
+    assert_eq!(health(task, Duration::ZERO, now), Health::NotReady);
 }
 
 #[test]

@@ -393,6 +393,7 @@ impl World {
             attempt: 0,
             exited: false,
             ready: None,
+            ready_since: None,
             ending: false,
             reason: String::new(),
             message: String::new(),
