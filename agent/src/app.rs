@@ -262,6 +262,7 @@ pub async fn serve(
     });
     let facts = Facts { kind, capacity, enforced, address: host_name() };
     let node = Node::new(&config, facts, Arc::clone(&shared));
+    let files = shared.files.clone();
     let mut supervisor = Supervisor::new(Arc::clone(&shared));
     tracing::info!(node = %shared.node, tasks = records.len(), "started");
     shared.restore(&records)?;
@@ -305,6 +306,7 @@ pub async fn serve(
     let _ = (session.await, engine.await);
     supervisor.shut_down().await;
     retiree.retire();
+    files.retire();
     tracing::info!("the agent ends; its tasks stay");
     Ok(())
 }

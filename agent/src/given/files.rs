@@ -134,6 +134,14 @@ impl Place {
         Ok(())
     }
 
+    /// The agent ends: its directory goes, when no task has files in it.
+    pub(crate) fn retire(&self) {
+        if let Ok(memory) = &self.memory {
+            // Not empty: the tasks stay.
+            let _ = fs::remove_dir(memory);
+        }
+    }
+
     /// Removes what tasks have that this agent does not know.
     pub(crate) fn sweep(&self, known: &BTreeSet<TaskUid>) {
         let Ok(memory) = &self.memory else { return };

@@ -364,6 +364,29 @@ spec:
     }
 
     #[tokio::test]
+    async fn a_secret_is_compared_as_it_is_stored_and_its_manifest_kept_without_values() {
+        let dir = tempfile::tempdir().expect("a directory");
+        let fake = Fake::new();
+        let apply = |data: &str| {
+            let text = format!("{{apiVersion: v1, kind: Secret, metadata: {{name: s}}, {data}}}");
+            let path = file(&dir, &text);
+            let fake = fake.clone();
+            async move { fake.run(&["apply", "-f", &path]).await.1 }
+        };
+        let both = "type: Opaque, stringData: {a: hunter2, b: x}";
+        assert_eq!(apply(both).await, "secret/s created\n");
+        let body = fake.last_body();
+        assert_eq!(body["data"], json!({"a": "aHVudGVyMg==", "b": "eA=="}));
+        let noted = body["metadata"]["annotations"].to_string();
+        assert!(!noted.contains("hunter2") && !noted.contains("aHVudGVyMg"), "{noted}");
+        assert_eq!(apply(both).await, "secret/s unchanged\n");
+        // A key that is taken out of the manifest goes, and one that somebody else made stays.
+        fake.edit("secrets/default/s", |o| o["data"]["c"] = json!("eQ=="));
+        assert_eq!(apply("type: Opaque, data: {a: bmV3}").await, "secret/s configured\n");
+        assert_eq!(fake.last_body()["data"], json!({"a": "bmV3", "b": null}));
+    }
+
+    #[tokio::test]
     async fn created_then_unchanged_then_configured() {
         let dir = tempfile::tempdir().expect("a directory");
         let fake = Fake::new();

@@ -1,8 +1,9 @@
-//! PATCH: JSON merge patch (RFC 7396) and JSON patch (RFC 6902).
+//! PATCH: JSON merge patch (RFC 7396) and JSON patch (RFC 6902). kubectl patches the kinds that it knows itself with a
+//! strategic merge; for those that hold only maps beside their metadata it is the same as a merge patch.
 
 use axum::body::Body;
 use bytes::Bytes;
-use http::Request;
+use http::{HeaderValue, Request, header};
 use json_patch::Patch;
 use serde_json::Value;
 
@@ -11,6 +12,7 @@ use super::update::{Options, change};
 use super::{Answer, Call, body, failure::Failure};
 
 const MERGE: &str = "application/merge-patch+json";
+const STRATEGIC: &str = "application/strategic-merge-patch+json";
 const JSON: &str = "application/json-patch+json";
 /// As many operations as Kubernetes takes.
 const OPERATIONS: usize = 10_000;
@@ -24,8 +26,18 @@ pub(super) enum Change {
 pub(super) async fn patch(call: Call, target: Object) -> Answer {
     let options = Options::read(&call)?;
     let Call { context, request, .. } = call;
+    let maps_only = matches!(target.entry.info.kind, "ConfigMap" | "Secret");
+    let request = if maps_only { as_merge(request) } else { request };
     let patch = of_request(request).await?;
     change(&context, &target, &options, |present| apply(&patch, present)).await
+}
+
+/// The request with a strategic merge patch taken for a merge patch. Its directives are no fields and are refused as such.
+fn as_merge(mut request: Request<Body>) -> Request<Body> {
+    if body::media_type(request.headers()) == STRATEGIC {
+        request.headers_mut().insert(header::CONTENT_TYPE, HeaderValue::from_static(MERGE));
+    }
+    request
 }
 
 /// The patch that a request brings.

@@ -63,6 +63,13 @@ async fn an_immutable_object_keeps_its_values() {
     let (code, _) = send(&admin, "PATCH", &path, json!({"metadata": {"labels": {"x": "y"}}})).await;
     assert_eq!(code, 200, "metadata may change");
 
+    let open = json!({"metadata": {"name": "o"}, "data": {"a": "1", "b": "2"}});
+    send(&admin, "POST", MAPS, open).await;
+    let media = "application/strategic-merge-patch+json";
+    let patch = json!({"data": {"b": null, "c": "3"}}).to_string();
+    let (code, patched) = send_as(&admin, "PATCH", &format!("{MAPS}/o"), media, patch).await;
+    assert_eq!((code, &patched["data"]), (200, &json!({"a": "1", "c": "3"})), "as kubectl does");
+
     let bad = json!({"metadata": {"name": "n"}, "data": {"a b": "x"}, "spec": {}});
     assert_eq!(refusal(&send(&admin, "POST", MAPS, bad).await), (422, "Invalid"));
     let (_, resources) = send(&admin, "GET", "/api/v1", Value::Null).await;

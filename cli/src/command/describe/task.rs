@@ -174,7 +174,7 @@ fn environment(sheet: &mut Sheet, all: &[EnvVar], from: &[EnvFrom]) {
     };
     let whole = |f: &EnvFrom| {
         let map = f.config_map_ref.as_ref().map(|r| ("configmap", r));
-        let (kind, of) = map.or(f.secret_ref.as_ref().map(|r| ("secret", r)))?;
+        let (kind, of) = map.or_else(|| f.secret_ref.as_ref().map(|r| ("secret", r)))?;
         Some(format!("{}* from {kind}/{}{}", f.prefix, of.name, optional(of.optional)))
     };
     sheet.list("Environment", from.iter().filter_map(whole).chain(all.iter().map(variable)));
@@ -183,7 +183,7 @@ fn environment(sheet: &mut Sheet, all: &[EnvVar], from: &[EnvFrom]) {
 fn files(sheet: &mut Sheet, all: &[Files]) {
     let line = |f: &Files| {
         let map = f.config_map.as_ref().map(|name| ("configmap", name));
-        let (kind, name) = map.or(f.secret.as_ref().map(|name| ("secret", name)))?;
+        let (kind, name) = map.or_else(|| f.secret.as_ref().map(|name| ("secret", name)))?;
         Some(format!("{} from {kind}/{name}{}", f.mount_path, optional(f.optional)))
     };
     sheet.list("Files", all.iter().filter_map(line));

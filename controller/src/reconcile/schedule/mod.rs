@@ -11,6 +11,7 @@
 //! the reservation is released and the store's next event brings the task back. What this task wrote
 //! itself is known already, and is passed over when the store tells it.
 
+mod holds;
 mod write;
 
 use std::collections::{BTreeSet, HashMap, HashSet};
@@ -26,10 +27,9 @@ use muster_api::name::NodeName;
 use muster_api::phase::TaskPhase;
 use muster_controller_core::cluster::{Cluster, Executor};
 use muster_controller_core::fairness::Accounts;
-use muster_controller_core::hold::Hold;
 use muster_controller_core::ledger::Reservation;
 use muster_controller_core::recent::Recent;
-use muster_controller_core::schedule::{self, Demand, Wait};
+use muster_controller_core::schedule::{self, Demand};
 use tokio::sync::{mpsc, oneshot};
 use tokio::time::Instant;
 
@@ -42,7 +42,7 @@ use crate::configs;
 use crate::context::Context;
 use crate::objects::{self, LEASES, NODES, QUOTAS, TASKS};
 use crate::session::poses::LivePoses;
-use crate::store::{Change, Event, Key, Stored, Watcher};
+use crate::store::{Change, Event, Stored, Watcher};
 
 /// How often changed numbers in a waiting task's reasons are written. New reasons are written at
 /// once; a reason whose numbers move with every bind would write without end.
@@ -397,34 +397,6 @@ impl Scheduler {
         }
     }
 
-    /// Why a task is not considered for a place, by what the store says now.
-    fn holds(&self, key: &Key, spec: &TaskSpec) -> Arc<[NodeRefusal]> {
-        let namespace = key.namespace().unwrap_or_default();
-        configs::holds(&self.context.store, namespace, spec).iter().map(Hold::refusal).collect()
-    }
-
-    /// What waiting tasks name has changed.
-    fn look_at_holds(&mut self, source: &Key) {
-        let names = |waiting: &Waiting| {
-            waiting.stored.key.namespace() == source.namespace()
-                && waiting.demand.spec.references().iter().any(|(kind, name)| {
-                    configs::key_of(*kind, source.namespace().unwrap_or_default(), name) == *source
-                })
-        };
-        let named = self.waiting.iter().filter(|(_, waiting)| names(waiting));
-        let uids: Vec<TaskUid> = named.map(|(uid, _)| uid.clone()).collect();
-        for uid in uids {
-            let Some(waiting) = self.waiting.get(&uid) else { continue };
-            let holds = self.holds(&waiting.stored.key, &waiting.demand.spec);
-            if !holds.is_empty() {
-                self.cluster.unnominate(&uid);
-            }
-            if let Some(waiting) = self.waiting.get_mut(&uid) {
-                waiting.holds = holds;
-            }
-        }
-    }
-
     /// Room that was being made before the cluster was made anew is kept on.
     fn take_in_nomination(&mut self, demand: &Demand, node: Option<String>) {
         let Some(node) = node.and_then(|n| NodeName::new(n).ok()) else { return };
@@ -465,23 +437,13 @@ impl Scheduler {
         }
     }
 
-    /// Who is considered for a place.
-    fn placeable(&self) -> impl Iterator<Item = &Waiting> {
-        self.waiting.values().filter(|w| w.holds.is_empty())
-    }
-
     /// Decides for everything that waits, and carries it out.
     async fn decide(&mut self) {
         self.look_again = None;
         if !self.waiting.is_empty() {
             let mut demands: Vec<Demand> = self.placeable().map(|w| w.demand.clone()).collect();
             let mut plan = schedule::schedule(&mut self.cluster, &mut demands);
-            plan.waits.extend(
-                self.waiting
-                    .values()
-                    .filter(|w| !w.holds.is_empty())
-                    .map(|w| Wait { uid: w.demand.uid.clone(), why: Arc::clone(&w.holds) }),
-            );
+            plan.waits.extend(self.held());
             let binds = self.bind_all(plan.binds).await;
             let preempted = self.preempt_all(plan.preemptions).await;
             let waits = self.write_reasons(plan.waits).await;
