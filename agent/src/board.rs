@@ -5,9 +5,11 @@ use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Instant;
 
+use muster_agent_core::depend::Seen;
 use muster_agent_core::report::Report;
+use muster_agent_core::workload::{State, Workload};
 use muster_api::id::TaskUid;
-use tokio::sync::Notify;
+use tokio::sync::{Notify, watch};
 
 use crate::runtime::{AttemptId, Runtime, Used};
 
@@ -18,6 +20,8 @@ pub(crate) struct Entry {
     /// The newest sequence that the controller has acknowledged.
     pub(crate) acked: u64,
     pub(crate) attempt: u32,
+    /// What the report says is known in this life of the agent, and not only remembered.
+    pub(crate) known: bool,
     pub(crate) runtime: Arc<dyn Runtime>,
     /// Memory that its spec reserves, bytes.
     pub(crate) reserved: u64,
@@ -30,6 +34,8 @@ pub(crate) struct Entry {
 pub(crate) struct Board {
     entries: Mutex<BTreeMap<TaskUid, Entry>>,
     changed: Notify,
+    /// For those who follow other tasks; any number of them.
+    news: watch::Sender<()>,
 }
 
 /// Usage over the time since the last look.
@@ -47,12 +53,12 @@ impl Board {
 
     pub(crate) fn publish(
         &self,
-        uid: &TaskUid,
-        report: &Report,
-        attempt: u32,
+        workload: &Workload,
         runtime: &Arc<dyn Runtime>,
         reserved: u64,
     ) {
+        let Workload { uid, report, attempt, .. } = workload;
+        let (attempt, known) = (*attempt, !matches!(workload.state, State::Recovering { .. }));
         let mut entries = self.entries();
         match entries.get_mut(uid) {
             Some(entry) => {
@@ -60,12 +66,14 @@ impl Board {
                     entry.sample = None;
                 }
                 (entry.report, entry.attempt, entry.reserved) = (report.clone(), attempt, reserved);
+                entry.known = known;
             }
             None => {
                 let entry = Entry {
                     report: report.clone(),
                     acked: 0,
                     attempt,
+                    known,
                     runtime: Arc::clone(runtime),
                     reserved,
                     sample: None,
@@ -75,10 +83,29 @@ impl Board {
         }
         drop(entries);
         self.changed.notify_one();
+        self.news.send_replace(());
     }
 
     pub(crate) fn withdraw(&self, uid: &TaskUid) {
         self.entries().remove(uid);
+        self.news.send_replace(());
+    }
+
+    /// Says when something about any task is new.
+    pub(crate) fn news(&self) -> watch::Receiver<()> {
+        self.news.subscribe()
+    }
+
+    /// A task of this node, as another one that waits for it sees it.
+    pub(crate) fn seen(&self, uid: &str) -> Option<Seen> {
+        let entries = self.entries();
+        let Entry { report, attempt, known, .. } = entries.get(uid)?;
+        Some(Seen {
+            phase: report.content.phase.into(),
+            ready: report.content.ready,
+            attempt: *attempt,
+            known: *known,
+        })
     }
 
     pub(crate) fn acknowledged(&self, uid: &str, sequence: u64) {

@@ -26,6 +26,7 @@ use crate::board::Board;
 use crate::checkpoint::{Assignment, Checkpoint, Record};
 use crate::clock;
 use crate::contact::Contact;
+use crate::depends::Others;
 use crate::durable::FileError;
 use crate::executor;
 use crate::executor::desk::Desks;
@@ -133,6 +134,8 @@ pub(crate) struct Driver {
     seat: Option<Seat>,
     /// While an attempt runs that has probes.
     probing: Option<Probing>,
+    /// The tasks that it waits for.
+    others: Others,
     dropped: bool,
 }
 
@@ -187,6 +190,7 @@ pub(crate) async fn drive(
     };
     shared.enrol(&record);
     let runtime = Arc::clone(shared.runtime(&record));
+    let others = Others::new(&shared.board);
     let files = !record.assignment.spec.run.wanted().files.is_empty();
     let mut driver = Driver {
         shared,
@@ -200,6 +204,7 @@ pub(crate) async fn drive(
         files,
         seat: None,
         probing: None,
+        others,
         dropped: false,
     };
     driver.carry_out(response).await;
@@ -210,7 +215,7 @@ fn publish(shared: &Shared, record: &Record) {
     let (workload, runtime) = (&record.workload, shared.runtime(record));
     let reserved = record.assignment.spec.resources.memory.map_or(0, |memory| memory.0);
     let board = &shared.board;
-    board.publish(&workload.uid, &workload.report, workload.attempt, runtime, reserved);
+    board.publish(workload, runtime, reserved);
 }
 
 fn context(shared: &Shared) -> Context {
@@ -232,6 +237,9 @@ impl Driver {
                 },
                 Some(event) = self.operations.next() => event,
                 event = verdict(&mut self.probing) => Some(event),
+                standing = self.others.news(&self.shared.board, &self.record.workload.desired.depends) => {
+                    Some(Event::Dependencies(standing))
+                }
                 () = sleep_until(wake) => {
                     let now = clock::boot();
                     self.wakes.retain(|wake| *wake > now);

@@ -14,6 +14,7 @@
 //! | `supervisor`, `driver` | what `muster-agent-core` decides, carried out |
 //! | `checkpoint`, `durable` | what survives the agent |
 //! | `board` | what tasks show of themselves |
+//! | `depends` | the tasks that a task waits for |
 //! | `given` | what tasks are given of ConfigMaps and Secrets |
 //! | `executor` | tasks that run other tasks, over a socket of their own |
 //! | `gauge` | what is read off the machine: battery, disk, labels |
@@ -33,6 +34,7 @@ pub mod config;
 mod contact;
 mod declared;
 mod driver;
+mod depends;
 mod durable;
 mod executor;
 mod footprint;

@@ -80,6 +80,7 @@ pub(crate) fn desired(spec: &TaskSpec, stop: Option<StopOrder>) -> Desired {
             .stop_after_disconnect()
             .map(|span| u64::try_from(span.as_duration().as_millis()).unwrap_or(u64::MAX)),
         probes: probe::probes(spec),
+        depends: Vec::new(),
         stop,
     }
 }

@@ -179,10 +179,32 @@ fn decode(message: proto::Assignments, known: &BTreeMap<TaskUid, Task>) -> (Assi
             let reason = "its end is recorded".to_owned();
             stop = stop.or(Some(StopOrder { grace_ms, reason }));
         }
-        assignments.upserts.insert(uid.clone(), spec::desired(&task_spec, stop));
+        let depends: Result<Vec<Dependency>, WireError> =
+            wire.dependencies.iter().map(dependency).collect();
+        let depends = match depends {
+            Ok(depends) => depends,
+            Err(error) => {
+                details.insert(uid.clone(), assignment(spec::nothing()));
+                assignments.unreadable.insert(uid, error.to_string());
+                continue;
+            }
+        };
+        let desired = Desired { depends, ..spec::desired(&task_spec, stop) };
+        assignments.upserts.insert(uid.clone(), desired);
         details.insert(uid, assignment(task_spec));
     }
     (assignments, details)
+}
+
+fn dependency(wire: &proto::Dependency) -> Result<Dependency, WireError> {
+    Ok(Dependency {
+        task: wire.task.clone(),
+        uid: wire.uid.clone(),
+        condition: dependency_condition_from_wire(wire.condition)?,
+        restart: wire.restart,
+        unmet: (!wire.met).then(|| wire.unmet.clone()),
+        attempt: wire.attempt,
+    })
 }
 
 /// A uid names a directory and a group: it must not lead out of them.

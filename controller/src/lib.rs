@@ -21,6 +21,7 @@ pub mod auth;
 pub mod config;
 pub mod configs;
 pub mod context;
+mod depends;
 pub mod events;
 pub mod kubeconfig;
 mod memory;

@@ -2,6 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
+use crate::depend::Dependency;
 use crate::probe::Probes;
 
 /// When a task whose main process ended starts again.
@@ -46,15 +47,18 @@ pub struct Desired {
     /// What is looked at while it runs.
     #[serde(default)]
     pub probes: Probes,
+    /// Tasks that must have come so far before an attempt begins.
+    #[serde(default)]
+    pub depends: Vec<Dependency>,
     /// Present: it must end.
     pub stop: Option<StopOrder>,
 }
 
 impl Desired {
-    /// A task that is not started again, may run without contact, and is not looked at.
+    /// A task that is not started again, may run without contact, is not looked at, and waits for nobody.
     #[must_use]
     pub fn once(grace_ms: u64) -> Desired {
         let (restart, probes) = (RestartPolicy::Never, Probes::default());
-        Desired { restart, grace_ms, stop_after_ms: None, probes, stop: None }
+        Desired { restart, grace_ms, stop_after_ms: None, probes, depends: Vec::new(), stop: None }
     }
 }

@@ -1,5 +1,6 @@
 //! What goes into a [`Workload`](crate::workload::Workload) and what comes out of it.
 
+use crate::depend::Standing;
 use crate::desired::Desired;
 use crate::observed::{Exit, Observed, Started};
 use crate::probe::Verdict;
@@ -32,6 +33,8 @@ pub enum Event {
     Attempt(u32, Outcome),
     /// The probes of the running attempt of this number say something new.
     Probed(u32, Verdict),
+    /// The tasks that it waits for stand so.
+    Dependencies(Standing),
     /// Everything of it is removed.
     Removed,
     /// Something of it could not be removed.

@@ -9,6 +9,7 @@
 //! | [`workload`] | one task's state machine: `Event` in, `Response` out |
 //! | [`restart`] | when an ended task starts again, and after how long |
 //! | [`probe`] | when a running attempt is checked, and what follows from the answers |
+//! | [`depend`] | the tasks that a task waits for: how far they are, and who was started again |
 //! | [`report`] | what is told to the controller, and its sequence |
 //! | [`executor`] | an executor and the works it was given: who may end, and on whose word |
 //! | [`plan`] | a set of assignments against the tasks that are known: who gets which event |
@@ -18,6 +19,7 @@
 //! runtime's answer is given back as an event exactly once per effect, in any order.
 #![deny(missing_docs)]
 
+pub mod depend;
 pub mod desired;
 pub mod event;
 pub mod executor;

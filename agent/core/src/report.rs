@@ -25,6 +25,18 @@ pub enum Phase {
     Failed,
 }
 
+impl From<Phase> for TaskPhase {
+    fn from(phase: Phase) -> Self {
+        match phase {
+            Phase::Starting => TaskPhase::Starting,
+            Phase::Running => TaskPhase::Running,
+            Phase::Stopping => TaskPhase::Stopping,
+            Phase::Succeeded => TaskPhase::Succeeded,
+            Phase::Failed => TaskPhase::Failed,
+        }
+    }
+}
+
 impl Phase {
     /// Whether the task has ended for good.
     #[must_use]
@@ -68,6 +80,10 @@ pub enum Reason {
     LivenessFailed,
     /// It was ended because its start-up probe failed.
     StartupFailed,
+    /// It waits for other tasks.
+    AwaitingDependency,
+    /// It is or was ended because a task that it depends on was started again.
+    DependencyRestarted,
     /// It waits for its executor.
     AwaitingExecutor,
     /// It waits before it is started again.
@@ -110,6 +126,8 @@ impl fmt::Display for Reason {
             Reason::NotReady => NOT_READY,
             Reason::LivenessFailed => LIVENESS_FAILED,
             Reason::StartupFailed => STARTUP_FAILED,
+            Reason::AwaitingDependency => "AwaitingDependency",
+            Reason::DependencyRestarted => "DependencyRestarted",
             Reason::AwaitingExecutor => "AwaitingExecutor",
             Reason::BackOff => "BackOff",
             Reason::AwaitingContact => "AwaitingContact",

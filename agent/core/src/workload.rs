@@ -12,10 +12,14 @@
 //! ever started.
 
 mod probed;
+mod waited;
+
+use std::collections::BTreeMap;
 
 use muster_api::id::TaskUid;
 use serde::{Deserialize, Serialize};
 
+use crate::depend::Standing;
 use crate::desired::{Desired, StopOrder};
 pub use crate::event::{Context, Effect, Event, Failure, Outcome, Response};
 use crate::observed::{End, Exit, Loss, Observed, Started};
@@ -149,6 +153,12 @@ pub struct Workload {
     /// The current attempt is to be ended, because a probe failed.
     #[serde(default)]
     pub condemned: Option<Condemned>,
+    /// How the tasks stand that it waits for; none: they are still to be looked at.
+    #[serde(default)]
+    pub standing: Option<Standing>,
+    /// Uid and attempt of tasks that it follows, when the current attempt began.
+    #[serde(default)]
+    pub began_with: BTreeMap<String, (String, u32)>,
     /// What is told about it.
     pub report: Report,
 }
@@ -199,6 +209,8 @@ impl Workload {
             failures: 0,
             verdicts: Verdicts::default(),
             condemned: None,
+            standing: None,
+            began_with: BTreeMap::new(),
             report: Report::accepted(),
         }
     }
@@ -206,6 +218,8 @@ impl Workload {
     /// A task read back after the agent was started anew. `same_boot`: the machine was not.
     pub fn restored(&mut self, same_boot: bool, context: Context) -> Response {
         self.report.sequence += SEQUENCE_GAP;
+        // The others may not have outlived the agent either.
+        self.standing = None;
         let mut effects = Vec::new();
         match &mut self.state {
             State::Waiting { until } => {
@@ -246,6 +260,7 @@ impl Workload {
                 self.on_verdict(verdict, context, &mut effects);
             }
             Event::Probed(..) => {}
+            Event::Dependencies(standing) => self.on_dependencies(standing, context, &mut effects),
             Event::Removed => {
                 if matches!(self.state, State::Removing { .. }) {
                     return Response { effects: vec![Effect::Drop] };
@@ -381,6 +396,8 @@ impl Workload {
         let State::Waiting { until } = self.state else { return };
         if context.now.boot < until {
             effects.push(Effect::WakeAt(until));
+        } else if self.waits_for_others() {
+            // Told anew when one of them has come farther.
         } else if self.in_contact(context) {
             if !std::mem::take(&mut self.unused) {
                 self.attempt += 1;
@@ -413,6 +430,8 @@ impl Workload {
     fn launch(&mut self, effects: &mut Vec<Effect>) {
         self.state = State::Launching;
         self.forget_verdicts();
+        let standing = self.standing.as_ref();
+        self.began_with = standing.map(|s| s.attempts.clone()).unwrap_or_default();
         self.say(Reason::None, String::new());
         effects.push(Effect::Launch(self.attempt));
     }
@@ -512,19 +531,22 @@ impl Workload {
             (content.reason, content.message) = failed;
         }
         let again = self.runs_again(exit);
-        let condemned = self.condemned.take().is_some();
+        let condemned = self.condemned.take();
         if again {
             self.restarts += 1;
             content.restarts = self.restarts;
         } else {
-            let well = exit.succeeded() && !condemned;
+            let well = exit.succeeded() && condemned.is_none();
             content.phase = if well { Phase::Succeeded } else { Phase::Failed };
         }
         let (reason, message) = (content.reason.clone(), content.message.clone());
         self.report.update(content);
         if again {
-            self.failures = restart::failures_after(self.failures, exit);
-            if exit.end == End::Lost(Loss::Reboot) {
+            let follows = matches!(condemned, Some(Condemned::Dependency { .. }));
+            if !follows {
+                self.failures = restart::failures_after(self.failures, exit);
+            }
+            if follows || exit.end == End::Lost(Loss::Reboot) {
                 self.state = State::Waiting { until: context.now.boot };
                 self.move_on(context, effects);
             } else {

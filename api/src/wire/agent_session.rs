@@ -10,6 +10,7 @@ use super::agent::v1 as proto;
 use crate::condition::{Condition, ConditionStatus};
 use crate::kind::node::upkeep::Battery;
 use crate::kind::node::{NodeKind, RuntimeStatus};
+use crate::kind::task::depend::DependencyCondition;
 use crate::kind::task::{TaskSpec, TaskUsage};
 use crate::name::FunctionName;
 use crate::phase::TaskPhase;
@@ -35,6 +36,33 @@ pub fn timestamp_from_wire(
     Timestamp::new(time.seconds, time.nanos)
         .map(MicroTime)
         .map_err(|e| WireError::invalid(field, e))
+}
+
+impl From<DependencyCondition> for proto::DependencyCondition {
+    fn from(condition: DependencyCondition) -> Self {
+        match condition {
+            DependencyCondition::Running => proto::DependencyCondition::Running,
+            DependencyCondition::Ready => proto::DependencyCondition::Ready,
+            DependencyCondition::Succeeded => proto::DependencyCondition::Succeeded,
+        }
+    }
+}
+
+/// How far a task must have come.
+///
+/// # Errors
+///
+/// When it is unspecified or not known.
+pub fn dependency_condition_from_wire(value: i32) -> Result<DependencyCondition, WireError> {
+    use proto::DependencyCondition as Wire;
+    match Wire::try_from(value) {
+        Ok(Wire::Running) => Ok(DependencyCondition::Running),
+        Ok(Wire::Ready) => Ok(DependencyCondition::Ready),
+        Ok(Wire::Succeeded) => Ok(DependencyCondition::Succeeded),
+        Ok(Wire::Unspecified) | Err(_) => {
+            Err(WireError::invalid("dependency.condition", format!("{value} is no condition")))
+        }
+    }
 }
 
 impl From<NodeKind> for proto::NodeKind {

@@ -37,6 +37,18 @@ pub enum Hold {
         /// The key.
         key: String,
     },
+    /// The task waits for another one that is not there.
+    DependencyNotFound {
+        /// Its name, in the task's namespace.
+        task: String,
+    },
+    /// The task waits for another one that has not come far enough.
+    DependencyNotMet {
+        /// Its name.
+        task: String,
+        /// What is missing, a clause whose subject is that task.
+        why: String,
+    },
     /// All that the task wants together is more than one message to its node takes.
     TooLarge {
         /// Bytes.
@@ -58,6 +70,8 @@ impl Hold {
             Hold::KeyNotFound { source: Secret, .. } => "SecretKeyNotFound",
             Hold::NotText { source: ConfigMap, .. } => "ConfigMapValueNotText",
             Hold::NotText { source: Secret, .. } => "SecretValueNotText",
+            Hold::DependencyNotFound { .. } => "DependencyNotFound",
+            Hold::DependencyNotMet { .. } => "DependencyNotMet",
             Hold::TooLarge { .. } => "ConfigTooLarge",
         }
     }
@@ -94,6 +108,12 @@ impl fmt::Display for Hold {
                 "the value of {key:?} in the {} {name} is not text, and a variable must be; use it as a file",
                 kind(*source)
             ),
+            Hold::DependencyNotFound { task } => {
+                write!(f, "waits for task {task}, which is not there; waits until it is created")
+            }
+            Hold::DependencyNotMet { task, why } => {
+                write!(f, "waits for task {task}, which {why}")
+            }
             Hold::TooLarge { bytes, most } => write!(
                 f,
                 "its ConfigMaps and Secrets come to {bytes} bytes, at most {most} are sent to a node"

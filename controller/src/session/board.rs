@@ -134,10 +134,10 @@ impl Board {
         let task = read.then(|| objects::read::<Task>(stored)).flatten();
         let placed = task.and_then(|task| {
             let node = NodeName::new(task.status.as_ref()?.node.clone()?).ok()?;
-            let sources = task.spec.references().into_iter();
             let namespace = stored.key.namespace().unwrap_or_default();
-            let sources: Vec<Key> =
-                sources.map(|(source, name)| configs::key_of(source, namespace, name)).collect();
+            let sources = task.spec.references().into_iter();
+            let sources = sources.map(|(source, name)| configs::key_of(source, namespace, name));
+            let sources: Vec<Key> = sources.chain(depends::keys(namespace, &task.spec)).collect();
             // Known as a user before the look: a change after it looks again.
             for source in sources {
                 lock(&self.pages).users.entry(source).or_default().insert(uid.clone());
@@ -210,6 +210,11 @@ fn assignment(store: &Store, task: &Task) -> wire::Assignment {
         stop,
         ended,
         config,
+        dependencies: if ended {
+            Vec::new()
+        } else {
+            depends::to_wire(store, &namespace_of(task), &task.spec)
+        },
         framework: super::frameworks::owning(&task.metadata)
             .map(|o| wire::Framework { id: o.uid.clone(), name: o.name.clone() }),
     }
@@ -269,6 +274,8 @@ pub async fn run(context: Arc<Context>, sessions: Arc<Sessions>) {
                 let key = &event.object.key;
                 if key.resource == TASKS {
                     board.take_in(&context.store, event.change, &event.object);
+                    // Others may wait for it.
+                    board.source_changed(&context.store, key);
                 } else if configs::is_source(key.resource) {
                     board.source_changed(&context.store, key);
                 }

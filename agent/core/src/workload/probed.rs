@@ -10,11 +10,19 @@ use crate::restart;
 
 /// Why an attempt is ended.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Condemned {
-    /// The probe that failed.
-    pub role: Role,
-    /// Its words.
-    pub why: String,
+pub enum Condemned {
+    /// A probe of it failed.
+    Probe {
+        /// Which.
+        role: Role,
+        /// Its words.
+        why: String,
+    },
+    /// A task that it depends on was started again.
+    Dependency {
+        /// The task's name.
+        task: String,
+    },
 }
 
 impl Workload {
@@ -30,7 +38,7 @@ impl Workload {
         }
         match verdict {
             Verdict::Failed { role, why } => {
-                self.condemned = Some(Condemned { role, why });
+                self.condemned = Some(Condemned::Probe { role, why });
                 self.end_if_wanted(context, effects);
             }
             verdict => self.verdicts.take(&verdict),
@@ -70,14 +78,22 @@ impl Workload {
     /// Why an attempt is being ended that nobody ordered to end.
     pub(super) fn condemned_for(&self) -> Option<(Reason, String)> {
         let condemned = self.condemned.as_ref().filter(|_| self.desired.stop.is_none())?;
-        Some((Reason::failed(condemned.role), format!("its {}", condemned.why)))
+        Some(match condemned {
+            Condemned::Probe { role, why } => (Reason::failed(*role), format!("its {why}")),
+            Condemned::Dependency { task } => {
+                (Reason::DependencyRestarted, format!("task {task} was started again"))
+            }
+        })
     }
 
-    /// Whether another attempt follows. One that was ended for its probe has failed, however its program took that.
+    /// Whether another attempt follows. One that was ended for its probe has failed, however its program took that; one
+    /// that was ended for another task follows it in any case.
     pub(super) fn runs_again(&self, exit: &Exit) -> bool {
-        let policy = match self.desired.restart {
-            RestartPolicy::OnFailure if self.condemned.is_some() => RestartPolicy::Always,
-            policy => policy,
+        let policy = match (self.desired.restart, &self.condemned) {
+            (RestartPolicy::OnFailure, Some(_)) | (_, Some(Condemned::Dependency { .. })) => {
+                RestartPolicy::Always
+            }
+            (policy, _) => policy,
         };
         self.desired.stop.is_none() && !self.forgotten && restart::restarts(policy, exit)
     }

@@ -1,6 +1,7 @@
 //! Task: one run of one program on one node, the unit that is placed.
 
 pub mod config;
+pub mod depend;
 pub mod probe;
 pub(super) mod rules;
 #[cfg(test)]
@@ -75,6 +76,10 @@ pub struct TaskSpec {
     /// with actuators and Keep for others.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub on_disconnect: Option<OnDisconnect>,
+    /// Tasks that must have come so far before an attempt of this one begins, also after a reboot of its node. Until all
+    /// have, it is not placed.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub depends_on: Vec<depend::DependsOn>,
     /// How long the task may be on its node, seconds from when it was placed; then it is stopped, and has Failed with
     /// the reason DeadlineExceeded. The controller keeps the time: a node without contact is told when it is back.
     #[serde(default, skip_serializing_if = "Option::is_none")]

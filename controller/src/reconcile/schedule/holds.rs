@@ -1,6 +1,7 @@
 //! Tasks that are not considered for a place, whatever the nodes are like: see [`muster_controller_core::hold`]. Looked at
-//! again when the task changes, or something that it names.
+//! again when the task changes, or something that it names: a ConfigMap, a Secret, another task.
 
+use std::collections::BTreeSet;
 use std::sync::Arc;
 
 use muster_api::id::TaskUid;
@@ -9,26 +10,36 @@ use muster_controller_core::hold::Hold;
 use muster_controller_core::schedule::Wait;
 
 use super::{Scheduler, Waiting};
-use crate::configs;
+use crate::{configs, depends};
 use crate::store::Key;
 
 impl Scheduler {
     /// Why a task is not considered for a place, by what the store says now.
     pub(super) fn holds(&self, key: &Key, spec: &TaskSpec) -> Arc<[NodeRefusal]> {
         let namespace = key.namespace().unwrap_or_default();
-        configs::holds(&self.context.store, namespace, spec).iter().map(Hold::refusal).collect()
+        let store = &self.context.store;
+        let others = depends::holds(store, namespace, spec);
+        let configs = configs::holds(store, namespace, spec);
+        others.iter().chain(&configs).map(Hold::refusal).collect()
     }
 
     /// What waiting tasks name has changed.
     pub(super) fn look_at_holds(&mut self, source: &Key) {
+        let namespace = source.namespace().unwrap_or_default();
         let names = |waiting: &Waiting| {
+            let spec = &waiting.demand.spec;
             waiting.stored.key.namespace() == source.namespace()
-                && waiting.demand.spec.references().iter().any(|(kind, name)| {
-                    configs::key_of(*kind, source.namespace().unwrap_or_default(), name) == *source
-                })
+                && spec
+                    .references()
+                    .iter()
+                    .any(|(kind, name)| configs::key_of(*kind, namespace, name) == *source)
         };
         let named = self.waiting.iter().filter(|(_, waiting)| names(waiting));
-        let uids: Vec<TaskUid> = named.map(|(uid, _)| uid.clone()).collect();
+        let uids = named.map(|(uid, _)| uid.clone()).collect();
+        self.look_again_at(uids);
+    }
+
+    fn look_again_at(&mut self, uids: BTreeSet<TaskUid>) {
         for uid in uids {
             let Some(waiting) = self.waiting.get(&uid) else { continue };
             let holds = self.holds(&waiting.stored.key, &waiting.demand.spec);
@@ -39,6 +50,24 @@ impl Scheduler {
                 waiting.holds = holds;
             }
         }
+    }
+
+    /// Remembers whom a task waits for.
+    pub(super) fn take_in_dependencies(&mut self, uid: &TaskUid, key: &Key, spec: &TaskSpec) {
+        for other in depends::keys(key.namespace().unwrap_or_default(), spec) {
+            self.dependents.entry(other).or_default().insert(uid.clone());
+        }
+    }
+
+    /// A task changed that others may wait for. Most are waited for by nobody.
+    pub(super) fn look_at_dependents(&mut self, of: &Key) {
+        let Some(uids) = self.dependents.get_mut(of) else { return };
+        uids.retain(|uid| self.waiting.contains_key(uid));
+        let uids = uids.clone();
+        if uids.is_empty() {
+            self.dependents.remove(of);
+        }
+        self.look_again_at(uids);
     }
 
     /// Who is considered for a place.

@@ -222,6 +222,7 @@ impl Scheduler {
         let old = std::mem::take(&mut self.cluster);
         self.desk.begin_anew();
         self.waiting.clear();
+        self.dependents.clear();
         self.own.clear();
         for resource in [QUOTAS, NODES, LEASES] {
             for stored in self.context.store.list(resource, None).items {
@@ -350,6 +351,7 @@ impl Scheduler {
                     spec: self.specs.share(task.spec),
                     since,
                 };
+                self.take_in_dependencies(&uid, &stored.key, &demand.spec);
                 let holds = self.holds(&stored.key, &demand.spec);
                 if holds.is_empty() {
                     self.take_in_nomination(&demand, status.nominated_node);

@@ -1,0 +1,104 @@
+//! Tasks that wait for others: what holds them, what their agents are told, and rings that are refused.
+
+use std::collections::BTreeSet;
+
+use muster_api::kind::task::depend::{self, Graph};
+use muster_api::kind::task::{Task, TaskSpec, TaskStatus};
+use muster_api::validate::{Violations, element_path};
+use muster_api::wire::agent::v1 as wire;
+use muster_controller_core::hold::Hold;
+use serde_json::Value;
+
+use crate::objects::{self, TASKS};
+use crate::store::{Key, Store};
+
+fn key_of(namespace: &str, name: &str) -> Key {
+    Key::namespaced(TASKS, namespace, name)
+}
+
+fn task(store: &Store, namespace: &str, name: &str) -> Option<Task> {
+    objects::read(&*store.get(&key_of(namespace, name))?)
+}
+
+/// The keys of the tasks that a task of `namespace` waits for.
+pub fn keys<'a>(namespace: &'a str, spec: &'a TaskSpec) -> impl Iterator<Item = Key> + 'a {
+    spec.depends_on.iter().map(move |one| key_of(namespace, &one.task))
+}
+
+/// What holds a task of `namespace`.
+#[must_use]
+pub fn holds(store: &Store, namespace: &str, spec: &TaskSpec) -> Vec<Hold> {
+    let hold = |one: &depend::DependsOn| {
+        let name = one.task.clone();
+        let Some(task) = task(store, namespace, &name) else {
+            return Some(Hold::DependencyNotFound { task: name });
+        };
+        let TaskStatus { phase, ready, .. } = task.status.unwrap_or_default();
+        let why = one.condition.unmet(phase, ready)?;
+        Some(Hold::DependencyNotMet { task: name, why })
+    };
+    spec.depends_on.iter().filter_map(hold).collect()
+}
+
+/// What the agent of a placed task is told of those that it waits for.
+#[must_use]
+pub fn to_wire(store: &Store, namespace: &str, spec: &TaskSpec) -> Vec<wire::Dependency> {
+    let dependency = |one: &depend::DependsOn| {
+        let task = task(store, namespace, &one.task);
+        let mut told = wire::Dependency {
+            task: one.task.clone(),
+            condition: wire::DependencyCondition::from(one.condition).into(),
+            restart: one.restart,
+            ..wire::Dependency::default()
+        };
+        match task {
+            // Gone after it was waited for: it had come far enough when this task was placed.
+            None => told.met = true,
+            Some(task) => {
+                let status = task.status.unwrap_or_default();
+                told.uid = task.metadata.uid.unwrap_or_default();
+                told.attempt = status.attempt;
+                let unmet = one.condition.unmet(status.phase, status.ready);
+                (told.met, told.unmet) = (unmet.is_none(), unmet.unwrap_or_default());
+            }
+        }
+        told
+    };
+    spec.depends_on.iter().map(dependency).collect()
+}
+
+/// Refuses a new task that would wait for itself.
+///
+/// Two that are created in the same moment can still close a ring; both wait then, and each says for which.
+pub(crate) fn check(store: &Store, object: &Value) -> Result<(), Violations> {
+    let named = |task: &Value| -> Vec<String> {
+        let all = task["spec"]["dependsOn"].as_array().into_iter().flatten();
+        all.filter_map(|one| one["task"].as_str().map(str::to_owned)).collect()
+    };
+    let first = named(object);
+    let metadata = &object["metadata"];
+    let (Some(name), Some(namespace)) = (metadata["name"].as_str(), metadata["namespace"].as_str())
+    else {
+        return Ok(());
+    };
+    let mut graph = Graph::new();
+    let mut left: Vec<String> = first.clone();
+    let mut seen: BTreeSet<String> = BTreeSet::from([name.to_owned()]);
+    graph.insert(name.to_owned(), first.clone());
+    while let Some(next) = left.pop() {
+        if !seen.insert(next.clone()) {
+            continue;
+        }
+        let stored = store.get(&key_of(namespace, &next)).filter(|s| s.mentions("dependsOn"));
+        let more = stored.map(|stored| named(&stored.value())).unwrap_or_default();
+        left.extend(more.iter().cloned());
+        graph.insert(next, more);
+    }
+    let Some(ring) = depend::cycle(&graph, name) else { return Ok(()) };
+    let at = first.iter().position(|task| Some(task) == ring.get(1)).unwrap_or(0);
+    let mut violations = Violations::new();
+    violations
+        .invalid(format!("{}.task", element_path("spec.dependsOn", at)), depend::ring_text(&ring))
+        .suggest("leave out one of them");
+    Err(violations)
+}
