@@ -19,7 +19,12 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let sessions = protox::compile([package("framework"), package("executor")], [root])?;
     let poses = protox::compile([package("pose")], [root])?;
     let plain = || tonic_prost_build::configure().build_client(false).build_server(false);
-    plain().bytes(".muster.agent.v1.Message.data").compile_fds(agent)?;
+    // Values of Secrets: `wire::secret` says how they are shown.
+    plain()
+        .bytes(".muster.agent.v1.Message.data")
+        .bytes(".muster.agent.v1.File.data")
+        .skip_debug([".muster.agent.v1.Variable", ".muster.agent.v1.File"])
+        .compile_fds(agent)?;
     plain().compile_fds(poses)?;
     plain()
         .bytes(".")

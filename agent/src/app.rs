@@ -28,6 +28,7 @@ use crate::durable::FileError;
 use crate::executor::desk::Desks;
 use crate::executor::work::WorkRuntime;
 use crate::footprint;
+use crate::given::files::Place;
 use crate::link::join::{self, Credentials, JoinError};
 use crate::link::session::{Command, Link};
 use crate::link::token::{Token, TokenError};
@@ -115,6 +116,7 @@ impl AgentError {
 
 /// Runs an agent until a signal ends it. Tasks stay.
 pub fn run(args: Args, reexec: Reexec) -> ExitCode {
+    footprint::keep_buffers();
     let done = tokio::runtime::Builder::new_current_thread()
         .enable_all()
         // For short file work only; each thread costs memory on a robot.
@@ -216,10 +218,13 @@ pub async fn serve(
     let checkpoint = Checkpoint::open(&config.data_dir)?;
     let records = checkpoint.read_all()?;
     let contact_file = config.data_dir.join("contact");
+    let files = Place::find(&identity.id, checkpoint.tasks());
+    files.sweep(&records.iter().map(|record| record.workload.uid.clone()).collect());
     let boot_id = clock::boot_id();
     let process = ProcessRuntime::new(
         ProcessConfig {
             tasks: checkpoint.tasks().to_owned(),
+            files: files.clone(),
             reexec: reexec.clone(),
             contact: contact_file.clone(),
             log: config.log,
@@ -231,6 +236,7 @@ pub async fn serve(
         socket: config.docker_socket.clone(),
         identity: identity.id.clone(),
         tasks: checkpoint.tasks().to_owned(),
+        files: files.clone(),
         reexec: reexec.clone(),
         contact: contact_file.clone(),
     });
@@ -248,6 +254,7 @@ pub async fn serve(
         works: Arc::new(works) as Arc<dyn Runtime>,
         boot_id,
         checkpoint,
+        files,
         board: Board::default(),
         process: Arc::new(process) as Arc<dyn Runtime>,
         docker: Arc::new(docker.clone()) as Arc<dyn Runtime>,

@@ -1,8 +1,10 @@
-//! What survives the agent: one small file a task, `tasks/<uid>/task.json`, whole and synced.
+//! What survives the agent: one small file a task, `tasks/<uid>/task.json`, whole and synced, and beside it
+//! `config.sealed` for a task that was given values of ConfigMaps and Secrets.
 
 use std::fs;
 use std::os::unix::fs::DirBuilderExt;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use muster_agent_core::workload::Workload;
 use muster_api::id::TaskUid;
@@ -10,6 +12,11 @@ use muster_api::kind::task::TaskSpec;
 use serde::{Deserialize, Serialize};
 
 use crate::durable::{self, FileError, Keep};
+use crate::given::Given;
+use crate::given::vault::Vault;
+
+/// The file with what a task is given.
+const SEALED: &str = "config.sealed";
 
 /// What the controller assigned.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -23,6 +30,9 @@ pub(crate) struct Assignment {
     /// Who launched it; none: a declared task.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub(crate) framework: Option<Framework>,
+    /// Values of ConfigMaps and Secrets for the next attempt: sealed, in a file of their own.
+    #[serde(skip)]
+    pub(crate) given: Given,
 }
 
 /// An outside scheduler.
@@ -62,6 +72,7 @@ pub(crate) fn token() -> String {
 #[derive(Debug, Clone)]
 pub(crate) struct Checkpoint {
     tasks: PathBuf,
+    vault: Arc<Vault>,
 }
 
 impl Checkpoint {
@@ -73,7 +84,7 @@ impl Checkpoint {
             .create(&tasks)
             .map_err(FileError::at("make", &tasks))?;
         durable::sync_dir(data_dir)?;
-        Ok(Checkpoint { tasks })
+        Ok(Checkpoint { tasks, vault: Arc::new(Vault::open(data_dir)?) })
     }
 
     pub(crate) fn tasks(&self) -> &Path {
@@ -84,12 +95,42 @@ impl Checkpoint {
         self.tasks.join(uid.as_str())
     }
 
-    pub(crate) fn write(&self, record: &Record) -> Result<(), FileError> {
-        let dir = self.task_dir(&record.workload.uid);
+    fn make_dir(&self, uid: &TaskUid) -> Result<PathBuf, FileError> {
+        let dir = self.task_dir(uid);
         if !dir.exists() {
             fs::DirBuilder::new().mode(0o711).create(&dir).map_err(FileError::at("make", &dir))?;
             durable::sync_dir(&self.tasks)?;
         }
+        Ok(dir)
+    }
+
+    /// Keeps what the task is given, before its record may name an attempt that needs it.
+    pub(crate) fn write_given(&self, uid: &TaskUid, given: &Given) -> Result<(), FileError> {
+        let path = self.make_dir(uid)?.join(SEALED);
+        let Some(given) = given else {
+            return match fs::remove_file(&path) {
+                Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
+                    Err(FileError::at("remove", &path)(error))
+                }
+                _ => Ok(()),
+            };
+        };
+        let sealed = self.vault.seal(uid, given).map_err(FileError::at("seal", &path))?;
+        durable::write(&path, &sealed, 0o600, Keep::PowerCut)
+    }
+
+    /// None: there is nothing, or nothing that this agent can open. The controller sends it again.
+    fn read_given(&self, uid: &TaskUid) -> Given {
+        let path = self.task_dir(uid).join(SEALED);
+        let given = self.vault.unseal(uid, fs::read(&path).ok()?);
+        if given.is_none() {
+            tracing::error!(%uid, path = %path.display(), "what the task was given cannot be opened");
+        }
+        given.map(Arc::new)
+    }
+
+    pub(crate) fn write(&self, record: &Record) -> Result<(), FileError> {
+        let dir = self.make_dir(&record.workload.uid)?;
         durable::write_json(&dir.join("task.json"), record, Keep::PowerCut)
     }
 
@@ -118,8 +159,11 @@ impl Checkpoint {
         let entries = fs::read_dir(&self.tasks).map_err(FileError::at("list", &self.tasks))?;
         for entry in entries {
             let dir = entry.map_err(FileError::at("list", &self.tasks))?.path();
-            match durable::read_json(&dir.join("task.json"))? {
-                Some(record) => records.push(record),
+            match durable::read_json::<Record>(&dir.join("task.json"))? {
+                Some(mut record) => {
+                    record.assignment.given = self.read_given(&record.workload.uid);
+                    records.push(record);
+                }
                 None => {
                     tracing::info!(dir = %dir.display(), "a directory of no task is removed");
                     let _ = fs::remove_dir_all(&dir);

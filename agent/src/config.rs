@@ -15,6 +15,7 @@ use serde::Deserialize;
 
 use crate::declared::Declared;
 use crate::durable::{self, FileError, Keep};
+use crate::gauge::battery::BatterySource;
 use crate::position::PositionSource;
 use crate::runtime::process::attempt::LogBounds;
 
@@ -41,7 +42,7 @@ impl From<Kind> for NodeKind {
 }
 
 /// Flags of `muster-agent` and of `muster agent`. What a node declares of itself (labels, sensors,
-/// actuators, map, position, cpu, memory, speed) is remembered in its data directory.
+/// actuators, map, position, cpu, memory, speed, battery) is remembered in its data directory.
 #[derive(Debug, Clone, Default, clap::Args)]
 pub struct Args {
     /// The controller, https://HOST:PORT; an agent that joined before knows it
@@ -87,6 +88,10 @@ pub struct Args {
     /// Usual speed of the robot, m/s [default: as given last]
     #[arg(long, value_name = "M/S")]
     pub speed: Option<f64>,
+    /// The robot's battery: `sysfs:NAME` as in /sys/class/power_supply, or `file:PATH` with a line
+    /// `PERCENT [charging]` that the robot keeps up to date [default: as given last]
+    #[arg(long, value_name = "SOURCE")]
+    pub battery: Option<String>,
     /// Run tasks with quotas even where the kernel cannot hold them to their quotas
     #[arg(long)]
     pub unenforced_quotas: bool,
@@ -118,6 +123,7 @@ struct FileConfig {
     cpu: Option<String>,
     memory: Option<String>,
     speed: Option<f64>,
+    battery: Option<String>,
     unenforced_quotas: bool,
     log_max_size: Option<String>,
     log_max_files: Option<u32>,
@@ -140,6 +146,7 @@ pub struct Config {
     pub(crate) cpu: Option<MilliCpu>,
     pub(crate) memory: Option<Bytes>,
     pub(crate) speed: Option<f64>,
+    pub(crate) battery: Option<BatterySource>,
     pub(crate) unenforced_quotas: bool,
     pub(crate) log: LogBounds,
     /// Absent: no Docker.
@@ -208,6 +215,7 @@ impl Args {
             cpu: self.cpu.or(file.cpu),
             memory: self.memory.or(file.memory),
             speed: self.speed.or(file.speed),
+            battery: self.battery.or(file.battery),
         };
         let remembered = declared.remember(Declared::last(&data_dir)?);
         let functions = |name, text: &Option<String>| {
@@ -237,6 +245,7 @@ impl Args {
             cpu: parsed("--cpu", &declared.cpu)?,
             memory: parsed("--memory", &declared.memory)?,
             speed: speed(declared.speed)?,
+            battery: parsed("--battery", &declared.battery)?,
             unenforced_quotas: self.unenforced_quotas || file.unenforced_quotas,
             log: log_bounds(
                 self.log_max_size.or(file.log_max_size),
@@ -408,6 +417,7 @@ mod tests {
             (Args { ar_res: Some("base".into()), ..args() }, "--ar-res"),
             (Args { labels: vec!["x".into()], ..args() }, "--label"),
             (Args { speed: Some(-1.0), ..args() }, "--speed"),
+            (Args { battery: Some("full".into()), ..args() }, "--battery"),
             (Args { kind: Some(Kind::Cloud), ar_res: Some("b:D".into()), ..args() }, "--kind"),
         ];
         for (args, flag) in bad {

@@ -23,6 +23,7 @@ pub(crate) struct Declared {
     pub(crate) cpu: Option<String>,
     pub(crate) memory: Option<String>,
     pub(crate) speed: Option<f64>,
+    pub(crate) battery: Option<String>,
 }
 
 impl Declared {
@@ -55,6 +56,7 @@ impl Declared {
         one("--cpu", fill(&mut self.cpu, last.cpu));
         one("--memory", fill(&mut self.memory, last.memory));
         one("--speed", fill(&mut self.speed, last.speed));
+        one("--battery", fill(&mut self.battery, last.battery));
         remembered
     }
 }

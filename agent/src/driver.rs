@@ -30,6 +30,8 @@ use crate::durable::FileError;
 use crate::executor;
 use crate::executor::desk::Desks;
 use crate::executor::seat::Seat;
+use crate::given;
+use crate::given::files::Place;
 use crate::probe::Probing;
 use crate::runtime::{AttemptId, Launch, Launched, Runtime};
 use crate::spec::{self, Kind, Surroundings};
@@ -44,6 +46,7 @@ pub(crate) struct Shared {
     pub(crate) node: String,
     pub(crate) boot_id: String,
     pub(crate) checkpoint: Checkpoint,
+    pub(crate) files: Place,
     pub(crate) board: Board,
     pub(crate) contact: Arc<Contact>,
     pub(crate) desks: Arc<Desks>,
@@ -122,6 +125,10 @@ pub(crate) struct Driver {
     operations: FuturesUnordered<Operation>,
     wakes: BTreeSet<Boot>,
     prepare: Option<AbortHandle>,
+    /// What the task is given is not yet durable.
+    unkept: bool,
+    /// Files of an attempt may be there.
+    files: bool,
     /// While processes of the task may exist: it may be an executor.
     seat: Option<Seat>,
     /// While an attempt runs that has probes.
@@ -160,6 +167,12 @@ pub(crate) async fn drive(
     inbox: mpsc::UnboundedReceiver<Message>,
 ) {
     let context = context(&shared);
+    let unkept = match &begin {
+        Begin::New(_, assignment, _) | Begin::Unreadable(_, assignment, _) => {
+            assignment.given.is_some()
+        }
+        Begin::Restored(..) => false,
+    };
     let (record, response) = match begin {
         Begin::New(uid, assignment, desired) => {
             let fetch = spec::fetch(&assignment.spec);
@@ -174,6 +187,7 @@ pub(crate) async fn drive(
     };
     shared.enrol(&record);
     let runtime = Arc::clone(shared.runtime(&record));
+    let files = !record.assignment.spec.run.wanted().files.is_empty();
     let mut driver = Driver {
         shared,
         runtime,
@@ -182,6 +196,8 @@ pub(crate) async fn drive(
         operations: FuturesUnordered::new(),
         wakes: BTreeSet::new(),
         prepare: None,
+        unkept,
+        files,
         seat: None,
         probing: None,
         dropped: false,
@@ -210,7 +226,7 @@ impl Driver {
                     None => return,
                     Some(Message::Event(event)) => Some(event),
                     Some(Message::Assigned(assignment, desired)) => {
-                        self.record.assignment = *assignment;
+                        self.reassign(*assignment).await;
                         Some(Event::Assigned(desired))
                     }
                 },
@@ -231,6 +247,42 @@ impl Driver {
         }
     }
 
+    /// Takes the controller's newest word. What it gives is durable before anything else happens: the next start of
+    /// the task may be that of another life of the agent, with nobody to ask.
+    async fn reassign(&mut self, mut assignment: Assignment) {
+        let before = std::mem::take(&mut self.record.assignment.given);
+        assignment.given = given::renew(&before, assignment.given);
+        self.unkept |= assignment.given != before;
+        self.record.assignment = assignment;
+        if self.unkept {
+            tracing::debug!(id = %self.id(), "other values for the next attempt");
+            self.keep_given().await;
+        }
+    }
+
+    async fn keep_given(&mut self) {
+        loop {
+            let (shared, uid) = (Arc::clone(&self.shared), self.record.workload.uid.clone());
+            let given = self.record.assignment.given.clone();
+            let write = move || shared.checkpoint.write_given(&uid, &given);
+            let Some(error) = blocking(write).await else { break };
+            tracing::error!(id = %self.id(), error = chain(&error), "the task waits for its disk");
+            tokio::time::sleep(WRITE_AGAIN).await;
+        }
+        self.unkept = false;
+    }
+
+    /// Removes the files of attempts that are over.
+    async fn clear_files(&mut self) {
+        let (files, uid) = (self.shared.files.clone(), self.record.workload.uid.clone());
+        match blocking(move || files.clear(&uid)).await {
+            None => self.files = false,
+            Some(error) => {
+                tracing::warn!(id = %self.id(), error = chain(&error), "a task's files stay behind");
+            }
+        }
+    }
+
     fn id(&self) -> AttemptId {
         let workload = &self.record.workload;
         AttemptId { uid: workload.uid.clone(), attempt: workload.attempt }
@@ -239,10 +291,13 @@ impl Driver {
     /// Keeps what is known of the task as an executor: before anything is started, and after the
     /// kernel has shown an end.
     async fn attend(&mut self) {
-        let workload = &self.record.workload;
-        if !workload.state.may_be_live() {
+        if !self.record.workload.state.may_be_live() {
             self.seat = None;
+            if self.files {
+                self.clear_files().await;
+            }
         }
+        let workload = &self.record.workload;
         if Kind::of(&self.record.assignment.spec) != Kind::Work {
             self.shared.desks.live(workload).await;
         }
@@ -314,6 +369,8 @@ impl Driver {
                     self.operations.push(operation);
                 }
                 Effect::Launch(_) | Effect::Watch(_) | Effect::Find(_) | Effect::Remove => {
+                    self.files |= matches!(effect, Effect::Launch(_))
+                        && !self.record.assignment.spec.run.wanted().files.is_empty();
                     let operation = self.operation(effect);
                     self.operations.push(operation);
                 }
@@ -326,6 +383,7 @@ impl Driver {
         let runtime = Arc::clone(&self.runtime);
         let launch = self.launch();
         let attempt = launch.id.attempt;
+        let ready = given::check(&self.record.assignment.spec, &launch.given);
         let answer = move |outcome| Some(Event::Attempt(attempt, outcome));
         match effect {
             Effect::Prepare(_) => async move {
@@ -336,6 +394,9 @@ impl Driver {
             }
             .boxed(),
             Effect::Launch(_) => async move {
+                if let Err(failure) = ready {
+                    return answer(Outcome::LaunchFailed(failure));
+                }
                 answer(match runtime.launch(&launch).await {
                     Launched::Running(started) => Outcome::Launched(started),
                     Launched::Ended(exit) => Outcome::Exited(exit),
@@ -397,6 +458,9 @@ impl Driver {
     }
 
     async fn persist(&mut self) {
+        if self.unkept {
+            self.keep_given().await;
+        }
         loop {
             let (shared, record) = (Arc::clone(&self.shared), self.record.clone());
             let write = move || shared.checkpoint.write(&record);
@@ -487,6 +551,7 @@ mod tests {
         Arc::new(Shared {
             node: "n".to_owned(),
             boot_id: "b".to_owned(),
+            files: Place::find("test", checkpoint.tasks()),
             checkpoint,
             board: Board::default(),
             contact: Arc::new(Contact::open(&dir.path().join("contact"), "b").unwrap()),
@@ -508,6 +573,7 @@ mod tests {
             spec: task_spec,
             lease: None,
             framework: None,
+            given: None,
         };
         Begin::New(TaskUid::new("t"), Box::new(assignment), desired)
     }

@@ -4,11 +4,33 @@
 //! pieces around what is touched, and a start touches most of it (flags, relocations, the join, the
 //! handshake). After the first contact those pages are let go; the few that an idle agent needs come
 //! back from the page cache by themselves, and the rest of it is the kernel's to use for tasks.
+//!
+//! The buffers of messages are the other way round: while messages go by, the same memory is wanted again at once, and a
+//! megabyte that is given back costs a page fault for each 4 KiB of the next one. [`keep_buffers`] lets it stay.
 
 use std::ops::Range;
 
+/// The longest free memory that is kept, bytes: the buffers of one message on its way in and out.
+#[cfg(target_env = "gnu")]
+const KEPT: libc::c_int = 8 << 20;
+
+/// From now on the allocator keeps memory that is freed, up to `KEPT`. Its own guess is a few hundred KiB, which each
+/// long message passes twice.
+pub(crate) fn keep_buffers() {
+    #[cfg(target_env = "gnu")]
+    for what in [libc::M_MMAP_THRESHOLD, libc::M_TRIM_THRESHOLD] {
+        // SAFETY: mallopt sets a number of the allocator; it locks what it must.
+        unsafe { libc::mallopt(what, KEPT) };
+    }
+}
+
 /// Lets go of the pages that are copies of files. They are read again when they are needed.
 pub(crate) fn give_back() {
+    #[cfg(target_env = "gnu")]
+    // SAFETY: gives back free memory of the allocator and nothing else.
+    unsafe {
+        libc::malloc_trim(0);
+    }
     let Ok(smaps) = std::fs::read_to_string("/proc/self/smaps") else { return };
     for range in unchanged(&smaps) {
         // SAFETY: the range is a mapping of this process in which the kernel counts no page that

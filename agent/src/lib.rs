@@ -14,7 +14,9 @@
 //! | `supervisor`, `driver` | what `muster-agent-core` decides, carried out |
 //! | `checkpoint`, `durable` | what survives the agent |
 //! | `board` | what tasks show of themselves |
+//! | `given` | what tasks are given of ConfigMaps and Secrets |
 //! | `executor` | tasks that run other tasks, over a socket of their own |
+//! | `gauge` | what is read off the machine: battery, disk, labels |
 //! | `footprint` | memory that is given back after the start |
 //! | `contact` | when the controller was last heard, for the shims too |
 //! | `link` | joining, the session, logs on request |
@@ -34,6 +36,8 @@ mod driver;
 mod durable;
 mod executor;
 mod footprint;
+mod gauge;
+mod given;
 mod link;
 mod node;
 mod position;

@@ -4,7 +4,9 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Duration;
 
-use muster_api::condition::{Condition, ConditionStatus, QUOTAS_ENFORCED};
+use muster_api::condition::{
+    Condition, ConditionStatus, DISK_PRESSURE, LOCALIZED, QUOTAS_ENFORCED,
+};
 use muster_api::kind::node::RuntimeStatus;
 use muster_api::pose::Pose;
 use muster_api::wire::agent::v1 as proto;
@@ -14,6 +16,9 @@ use tokio::time::Instant;
 use crate::capacity::{Capacity, Machine};
 use crate::config::{Config, Kind};
 use crate::driver::Shared;
+use crate::gauge::battery::{BatteryGauge, BatterySource};
+use crate::gauge::disk::DiskGauge;
+use crate::gauge::machine;
 use crate::position::Position;
 
 /// Between two live poses. A robot at 1.5 m/s moves 15 cm in it, less than placement by distance can care for.
@@ -26,6 +31,8 @@ pub(crate) struct Node {
     fixed: NodeReport,
     boot_id: String,
     position: Option<Position>,
+    battery: Option<BatteryGauge>,
+    disk: DiskGauge,
     machine: Machine,
     told: Option<proto::NodeState>,
     told_pose: Option<Pose>,
@@ -62,11 +69,17 @@ impl Node {
             conditions: conditions(config, facts.enforced),
             speed: config.speed,
             address: facts.address,
+            battery: None,
         };
         let position = match facts.kind {
             Kind::Robot => config.position.as_ref().map(|source| source.open(&config.map)),
             Kind::Cloud => None,
         };
+        let battery = match facts.kind {
+            Kind::Robot => config.battery.as_ref().map(BatterySource::open),
+            Kind::Cloud => None,
+        };
+        let disk = DiskGauge::open(&config.data_dir);
         let boot_id = shared.boot_id.clone();
         let machine = Machine::default();
         Node {
@@ -74,6 +87,8 @@ impl Node {
             fixed,
             boot_id,
             position,
+            battery,
+            disk,
             machine,
             told: None,
             told_pose: None,
@@ -103,7 +118,23 @@ impl Node {
             runtime("process", self.shared.process.status()),
             runtime("docker", self.shared.docker.status()),
         ];
-        let mut state = proto::NodeState::from(&NodeReport { runtimes, ..self.fixed.clone() });
+        let mut conditions = self.fixed.conditions.clone();
+        conditions.push(match self.disk.pressure() {
+            Some(why) => condition(DISK_PRESSURE, true, "DiskNearlyFull", why),
+            None => condition(DISK_PRESSURE, false, "EnoughSpace", String::new()),
+        });
+        if let Some(position) = &self.position {
+            let pose = position.current();
+            let (localized, reason) = match pose.map(|pose| pose.localized) {
+                Some(true) => (true, "Localized"),
+                Some(false) => (false, "Lost"),
+                None => (false, "NoPose"),
+            };
+            conditions.push(condition(LOCALIZED, localized, reason, String::new()));
+        }
+        let battery = self.battery.as_ref().and_then(BatteryGauge::charge);
+        let report = NodeReport { runtimes, conditions, battery, ..self.fixed.clone() };
+        let mut state = proto::NodeState::from(&report);
         state.boot_id.clone_from(&self.boot_id);
         state
     }
@@ -141,18 +172,22 @@ fn labels(config: &Config) -> BTreeMap<String, String> {
         ("muster.dev/arch".to_owned(), std::env::consts::ARCH.to_owned()),
         ("muster.dev/os".to_owned(), std::env::consts::OS.to_owned()),
     ]);
+    labels.extend(machine::labels());
     labels.extend(config.labels.clone());
     labels
 }
 
-fn conditions(config: &Config, enforced: Result<Enforced, String>) -> Vec<Condition> {
-    let condition = |r#type: &str, status: bool, reason: &str, message: String| Condition {
+fn condition(r#type: &str, holds: bool, reason: &str, message: String) -> Condition {
+    Condition {
         r#type: r#type.to_owned(),
-        status: ConditionStatus::from(status),
+        status: ConditionStatus::from(holds),
         reason: reason.to_owned(),
         message,
         last_transition_time: None,
-    };
+    }
+}
+
+fn conditions(config: &Config, enforced: Result<Enforced, String>) -> Vec<Condition> {
     let mut conditions = match enforced {
         Ok(Enforced { version: 1 }) => vec![
             condition(QUOTAS_ENFORCED, true, "CgroupV1", String::new()),

@@ -106,6 +106,7 @@ pub(crate) fn launch(id: AttemptId, assignment: &Assignment, around: &Surroundin
     Launch {
         program,
         env,
+        given: assignment.given.clone(),
         limits: limits(spec, around.unreserved),
         promised: resources.cpu.is_some()
             || resources.memory.is_some()
@@ -161,7 +162,8 @@ fn environment(
 }
 
 fn variables(list: &[task::EnvVar]) -> BTreeMap<String, String> {
-    list.iter().map(|variable| (variable.name.clone(), variable.value.clone())).collect()
+    let plain = list.iter().filter(|variable| variable.value_from.is_none());
+    plain.map(|variable| (variable.name.clone(), variable.value.clone())).collect()
 }
 
 fn program(assignment: &Assignment) -> (Program, BTreeMap<String, String>) {
@@ -196,6 +198,7 @@ fn program(assignment: &Assignment) -> (Program, BTreeMap<String, String>) {
                 task::Network::None => Network::None,
                 task::Network::Bridge => Network::Bridge,
             },
+            user: None,
             pull: match run.pull_policy {
                 task::PullPolicy::Always => Pull::Always,
                 task::PullPolicy::IfNotPresent => Pull::IfNotPresent,

@@ -137,6 +137,7 @@ fn decode(message: proto::Assignments, known: &BTreeMap<TaskUid, Task>) -> (Assi
     let mut assignments = Assignments {
         complete: message.complete,
         released: message.released.into_iter().map(TaskUid::new).collect(),
+        kept: message.kept.into_iter().map(TaskUid::new).collect(),
         ..Assignments::default()
     };
     let mut details = BTreeMap::new();
@@ -159,6 +160,7 @@ fn decode(message: proto::Assignments, known: &BTreeMap<TaskUid, Task>) -> (Assi
                 .framework
                 .clone()
                 .map(|proto::Framework { id, name }| Framework { id, name }),
+            given: wire.config.clone().map(Arc::new),
         };
         let task_spec = match spec::read(&wire.spec) {
             Ok(task_spec) => task_spec,
@@ -220,7 +222,8 @@ mod tests {
             ended: true,
             ..proto::Assignment::default()
         };
-        let message = proto::Assignments { complete: true, upserts: vec![wire], released: vec![] };
+        let message =
+            proto::Assignments { complete: true, upserts: vec![wire], ..Default::default() };
         let (assignments, _) = decode(message.clone(), &BTreeMap::new());
         assert!(assignments.upserts.is_empty());
         let (inbox, _messages) = mpsc::unbounded_channel();

@@ -44,6 +44,14 @@ pub struct Condition {
 pub const READY: &str = "Ready";
 /// A person confirmed that the node is off or that its processes are gone; what it held was given free.
 pub const FENCED: &str = "Fenced";
+/// The robot's battery has at least the charge below which nothing new begins there.
+pub const BATTERY: &str = "Battery";
+/// People work on the node (see `spec.maintenance`): nothing new begins there.
+pub const MAINTENANCE: &str = "Maintenance";
+/// The disk of the agent's data directory is nearly full: nothing new begins there.
+pub const DISK_PRESSURE: &str = "DiskPressure";
+/// The robot knows where it is.
+pub const LOCALIZED: &str = "Localized";
 /// Quotas of tasks are enforced by the kernel on this node (invariant 7).
 pub const QUOTAS_ENFORCED: &str = "QuotasEnforced";
 

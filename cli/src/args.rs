@@ -9,8 +9,8 @@ use muster_api::selector::{FieldSelector, LabelSelector, SelectorError};
 
 use crate::client::Selection;
 use crate::command::{
-    apply, cordon, delete, describe, drain, get, local, logs, node, offers, plan, rollout, scale,
-    token, top, version, wait, why,
+    apply, cordon, create, delete, describe, drain, get, local, logs, node, offers, plan, rollout,
+    scale, token, top, version, wait, why,
 };
 use crate::output::ui::Color;
 
@@ -57,6 +57,9 @@ pub(crate) struct Global {
 pub(crate) enum Command {
     /// Create or change objects so that they are as manifests say
     Apply(apply::Args),
+    /// Create a ConfigMap or a Secret from literals and files
+    #[command(subcommand)]
+    Create(create::Command),
     /// Show what applying manifests would do, by the real scheduler, without doing it
     Plan(plan::Args),
     /// List objects
@@ -175,6 +178,8 @@ mod tests {
         for line in [
             "muster apply -f a.yaml -f dir --wait --timeout 90s",
             "muster apply -f - --dry-run -o yaml",
+            "muster create configmap c --from-literal a=b --from-file dir",
+            "muster create secret s --from-file=k=path --type=kubernetes.io/tls",
             "muster get all -A",
             "muster get tk x y -o wide",
             "muster get task/x node/y -w",

@@ -236,6 +236,10 @@ fn check(mut part: Part, namespace: &str, given: bool) -> Result<Manifest, Vec<D
     }
     let namespace = info.namespaced.then(|| own.unwrap_or(namespace).to_owned());
     let mut written = part.object.clone();
+    if info.kind == "Secret" {
+        // Compared and patched as it is stored.
+        muster_api::kind::secret::merge_string_data(&mut written);
+    }
     for object in [&mut written, &mut admitted] {
         if let Some(namespace) = &namespace {
             object["metadata"]["namespace"] = namespace.as_str().into();

@@ -110,6 +110,7 @@ pub async fn run(
     config: Config,
     shutdown: impl Future<Output = ()> + Send,
 ) -> Result<(), AppError> {
+    crate::memory::keep_buffers();
     let running = start(config).await?;
     let address = running.address();
     tracing::info!(%address, url = running.context.url(), "serving");
@@ -128,7 +129,10 @@ pub async fn start(config: Config) -> Result<Running, AppError> {
     let pki = Pki::open(&config.data_dir.join("pki"), now)?;
     let tls = Arc::new(pki.server_config(&names(&config), now)?);
     let metrics = metrics::recorder()?;
-    let (store, writer) = store::sqlite::open(&config.data_dir.join("store.db")).await?;
+    let in_data_dir = || config.data_dir.join(store::sqlite::KEY_FILE);
+    let keys = config.encryption_key.clone().unwrap_or_else(in_data_dir);
+    let path = config.data_dir.join("store.db");
+    let (store, writer) = store::sqlite::open_with_keys(&path, &keys).await?;
     let listen = |source| AppError::Listen { address: config.listen, source };
     let listener = TcpListener::bind(config.listen).await.map_err(listen)?;
     let address = listener.local_addr().map_err(listen)?;

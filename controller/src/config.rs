@@ -19,6 +19,10 @@ pub struct Args {
     /// A name or address under which agents reach this controller; may be given several times
     #[arg(long, value_name = "HOST")]
     pub advertise: Vec<String>,
+    /// The keys with which Secrets are sealed in the store, one a line, the newest first; made when it is missing and
+    /// nothing was sealed yet [default: encryption.key in the data directory]
+    #[arg(long, value_name = "FILE")]
+    pub encryption_key: Option<PathBuf>,
 }
 
 /// What the controller needs to know to run.
@@ -34,6 +38,8 @@ pub struct Config {
     pub kubeconfig_asked: bool,
     /// Names and addresses for the certificate and for join commands, best first.
     pub advertise: Vec<String>,
+    /// The keys of the Secrets; none: beside the store.
+    pub encryption_key: Option<PathBuf>,
 }
 
 impl From<Args> for Config {
@@ -46,6 +52,7 @@ impl From<Args> for Config {
             kubeconfig_asked: args.kubeconfig.is_some(),
             kubeconfig: args.kubeconfig.unwrap_or_else(|| own.join("config")),
             advertise: args.advertise,
+            encryption_key: args.encryption_key,
         }
     }
 }

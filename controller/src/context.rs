@@ -11,6 +11,7 @@ use tokio_util::sync::CancellationToken;
 use crate::config::Config;
 use crate::events::Recorder;
 use crate::pki::Pki;
+use crate::quota::Door;
 use crate::reconcile::schedule;
 use crate::rest::log::LogSource;
 use crate::session::Sessions;
@@ -54,6 +55,8 @@ pub struct Context {
     /// Held while a task is given to a node (shared) and while a Node is deleted (alone): a Node is found unused and is
     /// gone before the next task is given to it, or the other way round.
     pub(crate) placing: tokio::sync::RwLock<()>,
+    /// Lets new tasks into namespaces that have a Quota.
+    pub(crate) door: Arc<Door>,
     pub(crate) metrics: PrometheusHandle,
     logs: OnceLock<Arc<dyn LogSource>>,
     live: OnceLock<Live>,
@@ -90,6 +93,7 @@ impl Context {
             stop: CancellationToken::new(),
             events,
             placing: tokio::sync::RwLock::new(()),
+            door: Arc::default(),
             metrics,
             logs: OnceLock::new(),
             live: OnceLock::new(),

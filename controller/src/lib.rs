@@ -4,6 +4,7 @@
 //! |---|---|
 //! | [`app`] | starts, joins and ends everything |
 //! | [`config`] | flags and their defaults |
+//! | [`configs`] | ConfigMaps and Secrets, from the store to tasks |
 //! | [`context`] | what the parts share |
 //! | [`store`] | revisioned objects, durable writes, watches |
 //! | [`rest`] | Kubernetes API conventions over the store |
@@ -11,18 +12,22 @@
 //! | [`reconcile`] | level-triggered loops: scheduling, health, deletion, garbage |
 //! | [`pki`], [`auth`] | certificates; who asks and whether they may |
 //! | [`events`], [`objects`] | Event objects; typed reading and writing of the kinds |
+//! | `quota` | the door of namespaces with a Quota |
 //! | `serve` | the TLS port |
-//! | `kubeconfig`, `metrics` | the admin's credential file; the Prometheus recorder |
+//! | `kubeconfig`, `metrics`, `memory` | the admin's credential file; the Prometheus recorder; what the allocator keeps |
 
 pub mod app;
 pub mod auth;
 pub mod config;
+pub mod configs;
 pub mod context;
 pub mod events;
 pub mod kubeconfig;
+mod memory;
 mod metrics;
 pub mod objects;
 pub mod pki;
+mod quota;
 pub mod reconcile;
 pub mod rest;
 mod serve;

@@ -16,6 +16,8 @@ pub struct Assignments {
     pub upserts: BTreeMap<TaskUid, Desired>,
     /// Tasks whose ends are recorded.
     pub released: BTreeSet<TaskUid>,
+    /// With `complete`: tasks that this node should have as well, and was told of before.
+    pub kept: BTreeSet<TaskUid>,
     /// Tasks that were sent but could not be read, and why: not started, and not taken for absent.
     pub unreadable: BTreeMap<TaskUid, String>,
 }
@@ -67,6 +69,7 @@ pub fn plan(assignments: Assignments, known: &BTreeMap<TaskUid, bool>) -> Plan {
             assignments.upserts.contains_key(uid)
                 || assignments.unreadable.contains_key(uid)
                 || assignments.released.contains(uid)
+                || assignments.kept.contains(uid)
         };
         for uid in known.keys().filter(|uid| !named(uid)) {
             plan.steps.push(Step::Tell(uid.clone(), Event::Unassigned));
@@ -110,8 +113,10 @@ mod tests {
         let wanted = Assignments {
             complete: true,
             upserts: BTreeMap::from([(uid("b"), desired()), (uid("d"), desired())]),
+            kept: BTreeSet::from([uid("e")]),
             ..Assignments::default()
         };
+        let known = known.into_iter().chain([(uid("e"), false)]).collect();
         assert_eq!(
             plan(wanted, &known).steps,
             [

@@ -2,6 +2,8 @@
 
 use std::io;
 
+use bytes::{BufMut as _, BytesMut};
+use muster_api::wire::Rope;
 use prost::Message;
 use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt};
 
@@ -25,9 +27,14 @@ where
     if length > FRAME_MAX {
         return Err(invalid(format!("a frame of {length} bytes; the longest is {FRAME_MAX}")));
     }
-    let mut bytes = vec![0; length];
-    from.read_exact(&mut bytes).await?;
-    M::decode(bytes::Bytes::from(bytes)).map(Some).map_err(|error| invalid(error.to_string()))
+    let mut bytes = BytesMut::with_capacity(length);
+    while bytes.len() < length {
+        let left = length - bytes.len();
+        if from.read_buf(&mut (&mut bytes).limit(left)).await? == 0 {
+            return Err(io::ErrorKind::UnexpectedEof.into());
+        }
+    }
+    M::decode(bytes.freeze()).map(Some).map_err(|error| invalid(error.to_string()))
 }
 
 /// Not cancel-safe.
@@ -37,10 +44,11 @@ where
     W: AsyncWrite + Unpin,
 {
     let length = u32::try_from(message.encoded_len()).map_err(io::Error::other)?;
-    let mut bytes = Vec::with_capacity(message.encoded_len() + 4);
-    bytes.extend_from_slice(&length.to_be_bytes());
-    message.encode(&mut bytes).map_err(io::Error::other)?;
-    to.write_all(&bytes).await
+    let mut frame = Rope::new();
+    frame.put_u32(length);
+    message.encode(&mut frame).map_err(io::Error::other)?;
+    frame.seal();
+    to.write_all_buf(&mut frame).await
 }
 
 #[cfg(test)]

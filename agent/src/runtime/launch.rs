@@ -7,6 +7,8 @@ use std::path::PathBuf;
 use muster_api::id::TaskUid;
 use serde::{Deserialize, Serialize};
 
+use crate::given::Given;
+
 /// One attempt of one task.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 pub(crate) struct AttemptId {
@@ -97,6 +99,9 @@ pub(crate) struct Container {
     pub(crate) mounts: Vec<Mount>,
     pub(crate) network: Network,
     pub(crate) pull: Pull,
+    /// The image's user, when it is given by number and files are to be its own.
+    #[serde(default)]
+    pub(crate) user: Option<(u32, u32)>,
 }
 
 /// A directory of the host in a container.
@@ -125,13 +130,16 @@ pub(crate) enum Pull {
 }
 
 /// Everything that a runtime needs to start an attempt.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "camelCase")]
 pub(crate) struct Launch {
     pub(crate) id: AttemptId,
     pub(crate) program: Program,
     /// On top of the agent's own environment for a process, of the image's for a container.
     pub(crate) env: BTreeMap<String, String>,
+    /// Values of ConfigMaps and Secrets; its variables go before `env`. Never in a file.
+    #[serde(skip)]
+    pub(crate) given: Given,
     pub(crate) limits: Limits,
     /// Whether a limit is a promise to the user: without enforcement the launch is refused. The
     /// caps that the agent adds on its own are dropped instead.

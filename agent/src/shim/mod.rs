@@ -12,7 +12,8 @@
 //! | `watch` | signals, timer, pipes: one poll loop around the kill ladder |
 //! | `output` | pipes → rotated log files |
 //!
-//! It is a hidden verb of the agent's binary: `… shim DIR --lock-fd N`. Its standard output is a pipe
+//! It is a hidden verb of the agent's binary: `… shim DIR --lock-fd N`. Its standard input holds the variables of
+//! ConfigMaps and Secrets, which are in no file. Its standard output is a pipe
 //! to the agent, which gets one byte: `R` the program runs, `E` it is over already.
 
 mod guard;
@@ -20,9 +21,10 @@ mod output;
 pub(crate) mod start;
 mod watch;
 
+use std::collections::BTreeMap;
 use std::ffi::OsString;
 use std::fs::File;
-use std::io::Write;
+use std::io::{Read as _, Write};
 use std::os::fd::{AsFd, FromRawFd, OwnedFd, RawFd};
 use std::path::PathBuf;
 
@@ -34,6 +36,7 @@ use crate::durable::FileError;
 use crate::runtime::process::attempt::{AttemptDir, Begun, Order, Process, Running};
 use crate::runtime::process::reach::{Reach, mark};
 use crate::runtime::process::scan;
+use start::StartError;
 
 /// The verb that both binaries know.
 pub const VERB: &str = "shim";
@@ -118,7 +121,7 @@ fn run(dir: &AttemptDir, lock: &OwnedFd) -> Result<(), ShimError> {
     if let Some(guarded) = order.guarded {
         return guard::guard(dir, &order, guarded, &signals);
     }
-    let started = match start::start(&order) {
+    let started = match take_variables().and_then(|given| start::start(&order, &given)) {
         Ok(started) => started,
         Err(error) => {
             remove_group(&order);
@@ -165,6 +168,20 @@ pub(crate) fn reach(order: &Order, shim: i32, session: Option<i32>) -> Reach {
 /// The numbers of a `user` field, if there is such a user.
 pub(crate) fn user_ids(user: &str) -> Option<(u32, u32)> {
     start::ids(user)
+}
+
+/// Variables that are in no file. Afterwards they are nowhere but in the program's environment.
+fn take_variables() -> Result<BTreeMap<String, String>, StartError> {
+    let failed = |source| StartError::Step { step: "read its variables", source };
+    let mut text = Vec::new();
+    std::io::stdin().read_to_end(&mut text).map_err(failed)?;
+    if text.is_empty() {
+        return Ok(BTreeMap::new());
+    }
+    let null = File::open("/dev/null").map_err(failed)?;
+    rustix::stdio::dup2_stdin(null).map_err(|errno| failed(errno.into()))?;
+    serde_json::from_slice(&text)
+        .map_err(|_| StartError::Order("its variables cannot be read".to_owned()))
 }
 
 fn remove_group(order: &Order) {

@@ -4,6 +4,7 @@
 //! directory, exec. The program is in its group before its first instruction. A check of a running task (see
 //! [`crate::runtime::process`]) goes the same way, so that it finds what the task's program finds.
 
+use std::collections::BTreeMap;
 use std::ffi::CString;
 use std::fmt;
 use std::io;
@@ -66,7 +67,10 @@ struct Identity {
     home: Option<String>,
 }
 
-pub(super) fn start(order: &Order) -> Result<Started, StartError> {
+pub(super) fn start(
+    order: &Order,
+    given: &BTreeMap<String, String>,
+) -> Result<Started, StartError> {
     let Program::Process { argv, .. } = &order.launch.program else {
         return Err(StartError::Order("the order is for a container".to_owned()));
     };
@@ -75,14 +79,15 @@ pub(super) fn start(order: &Order) -> Result<Started, StartError> {
             .map_err(|source| StartError::Step { step: "make its pipes", source: source.into() })
     };
     let ((stdout, child_stdout), (stderr, child_stderr)) = (pipe()?, pipe()?);
-    let child = spawn(order, argv, (child_stdout, child_stderr), false)?;
+    let child = spawn(order, given, argv, (child_stdout, child_stderr), false)?;
     Ok(Started { pid: child.id().cast_signed(), stdout, stderr })
 }
 
-/// Starts `argv` where and as whom the order's own program was started, with these as its output. `tied`: it is killed
-/// when the thread that called this ends.
+/// Starts `argv` where and as whom the order's own program was started, with what it was `given` of ConfigMaps and
+/// Secrets as variables, and these as its output. `tied`: it is killed when the thread that called this ends.
 pub(crate) fn spawn(
     order: &Order,
+    given: &BTreeMap<String, String>,
     argv: &[String],
     (stdout, stderr): (OwnedFd, OwnedFd),
     tied: bool,
@@ -117,6 +122,7 @@ pub(crate) fn spawn(
         command.env("HOME", home);
     }
     command.envs(&order.launch.env);
+    command.envs(given);
     if let Some((name, value)) = mark(&order.launch.id).split_once('=') {
         command.env(name, value);
     }

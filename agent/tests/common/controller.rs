@@ -175,6 +175,7 @@ impl Controller {
             complete: false,
             upserts: vec![assignment],
             released: vec![],
+            kept: Vec::new(),
         }));
     }
 
@@ -191,6 +192,7 @@ impl Controller {
             complete: false,
             upserts: vec![],
             released: vec![uid.to_owned()],
+            kept: Vec::new(),
         }));
     }
 
@@ -422,6 +424,7 @@ impl AgentService for Service {
                 complete: true,
                 upserts: seen.assignments.values().cloned().collect(),
                 released: vec![],
+                kept: Vec::new(),
             }));
             seen.session = Some(out);
         }

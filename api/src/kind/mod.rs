@@ -1,12 +1,15 @@
 //! The resources. One file a kind: spec, status, rules. [`ALL`] is the one list of them, and
 //! [`admit`] the one gate that an object passes before it is stored, in the client and the server.
 
+pub mod config_map;
 pub mod event;
 pub mod framework;
+pub mod keyed;
 pub mod lease;
 pub mod namespace;
 pub mod node;
 pub mod quota;
+pub mod secret;
 pub mod task;
 pub mod taskset;
 pub mod taskset_revision;
@@ -72,6 +75,8 @@ pub static ALL: &[KindInfo] = &[
     lease::INFO,
     framework::INFO,
     quota::INFO,
+    config_map::INFO,
+    secret::INFO,
     namespace::INFO,
     event::INFO,
 ];

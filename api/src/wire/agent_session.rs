@@ -8,6 +8,7 @@ use k8s_openapi::jiff::Timestamp;
 use super::WireError;
 use super::agent::v1 as proto;
 use crate::condition::{Condition, ConditionStatus};
+use crate::kind::node::upkeep::Battery;
 use crate::kind::node::{NodeKind, RuntimeStatus};
 use crate::kind::task::{TaskSpec, TaskUsage};
 use crate::name::FunctionName;
@@ -177,6 +178,8 @@ pub struct NodeReport {
     pub speed: Option<f64>,
     /// The machine's address.
     pub address: String,
+    /// The charge of its battery.
+    pub battery: Option<Battery>,
 }
 
 impl TryFrom<&proto::NodeState> for NodeReport {
@@ -203,6 +206,10 @@ impl TryFrom<&proto::NodeState> for NodeReport {
             speed: (state.speed_mps > 0.0 && state.speed_mps.is_finite())
                 .then_some(state.speed_mps),
             address: state.address.clone(),
+            battery: state.battery.as_ref().map(|battery| Battery {
+                percent: u8::try_from(battery.percent).unwrap_or(u8::MAX).min(100),
+                charging: battery.charging,
+            }),
         })
     }
 }
@@ -232,6 +239,10 @@ impl From<&NodeReport> for proto::NodeState {
             speed_mps: report.speed.unwrap_or(0.0),
             boot_id: String::new(),
             address: report.address.clone(),
+            battery: report.battery.map(|battery| proto::Battery {
+                percent: battery.percent.into(),
+                charging: battery.charging,
+            }),
         }
     }
 }
@@ -304,6 +315,7 @@ mod tests {
             conditions: Vec::new(),
             speed: Some(0.5),
             address: "127.0.0.1".to_owned(),
+            battery: Some(Battery { percent: 83, charging: true }),
         }
     }
 

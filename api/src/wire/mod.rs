@@ -5,8 +5,11 @@ pub mod agent_session;
 mod error;
 pub mod framework_session;
 pub mod pose_stream;
+mod rope;
+mod secret;
 
 pub use error::WireError;
+pub use rope::Rope;
 
 /// HTTP/2's windows for sessions, of a stream and of a connection, bytes: the longest message and one more behind it
 /// are under way without a word from the other side. With the usual 64 KiB to 1 MiB a long message stands still for a round

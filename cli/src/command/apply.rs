@@ -13,7 +13,7 @@ use futures::{StreamExt as _, TryStreamExt as _};
 use muster_api::duration::Span;
 use serde_json::{Map, Value, json};
 
-use super::{FirstError, Outcome, settle};
+use super::{FirstError, Outcome, plan, settle};
 use crate::args::span;
 use crate::client::{Client, Mode};
 use crate::error::CliError;
@@ -35,6 +35,9 @@ pub(crate) struct Args {
     /// Let the controller check everything, and store nothing
     #[arg(long)]
     dry_run: bool,
+    /// Do what `muster plan` said under this index, or nothing when it would now be something else
+    #[arg(long, value_name = "INDEX")]
+    check_index: Option<String>,
     /// Wait until every task runs, has ended, or says why it waits
     #[arg(long, conflicts_with = "dry_run")]
     wait: bool,
@@ -70,8 +73,11 @@ pub(crate) async fn run(args: Args, session: &mut Session) -> Outcome {
     let client = &session.client;
     let steps = look_at_all(client, manifests).await?;
     // One object is checked and stored by one request anyway.
-    if args.dry_run || steps.len() > 1 {
+    if args.dry_run || steps.len() > 1 || args.check_index.is_some() {
         rehearse(client, &steps).await?;
+    }
+    if let Some(index) = &args.check_index {
+        plan::check(session, &steps, index).await?;
     }
     let mode = if args.dry_run { Mode::DryRun } else { Mode::Store };
     let (applied, failed) = store(session, steps, mode, args.output).await?;
@@ -112,6 +118,11 @@ fn decide(manifest: &Manifest, current: Option<Value>) -> Action {
             metadata.remove("annotations");
         }
     }
+    let secret = manifest.info.kind == "Secret";
+    if secret {
+        // Which keys it had is all that the next apply needs to know.
+        hide_values(&mut last["data"]);
+    }
     let annotation = Value::from(last.to_string());
     let Some(current) = current else {
         let mut object = manifest.written.clone();
@@ -131,7 +142,26 @@ fn decide(manifest: &Manifest, current: Option<Value>) -> Action {
     let patch = three_way(before.as_ref(), &wanted, &current);
     match patch.as_object().is_none_or(Map::is_empty) {
         true => Action::Nothing(current),
-        false => Action::Patch { fields: field_changes(&patch, &current), patch },
+        false => {
+            let mut fields = field_changes(&patch, &current);
+            if secret {
+                fields.iter_mut().filter(|f| f.path.starts_with("data")).for_each(hide_change);
+            }
+            Action::Patch { fields, patch }
+        }
+    }
+}
+
+fn hide_values(data: &mut Value) {
+    if let Some(values) = data.as_object_mut() {
+        values.values_mut().for_each(|value| *value = Value::from(""));
+    }
+}
+
+/// That something of a Secret changed is shown, and not to what.
+fn hide_change(change: &mut FieldChange) {
+    for side in [&mut change.from, &mut change.to] {
+        *side = side.take().map(|_| Value::from("(hidden)"));
     }
 }
 
@@ -213,7 +243,7 @@ pub(super) async fn rehearse(client: &Client, steps: &[Step]) -> Result<(), CliE
 fn rank(step: &Step) -> (u8, Reverse<i64>) {
     let first = match step.manifest.info.kind {
         "Namespace" => 0,
-        "Node" => 1,
+        "Node" | "ConfigMap" | "Secret" => 1,
         _ => 2,
     };
     let priority = step.manifest.admitted.pointer("/spec/priority").and_then(Value::as_i64);

@@ -3,6 +3,7 @@
 pub(crate) mod apply;
 pub(crate) mod completion;
 pub(crate) mod cordon;
+pub(crate) mod create;
 pub(crate) mod delete;
 pub(crate) mod describe;
 pub(crate) mod drain;
@@ -72,6 +73,7 @@ fn run_client(command: Command, global: Global) -> Outcome {
 pub(crate) async fn dispatch(command: Command, session: &mut Session) -> Outcome {
     match command {
         Command::Apply(args) => apply::run(args, session).await,
+        Command::Create(command) => create::run(command, session).await,
         Command::Plan(args) => plan::run(args, session).await,
         Command::Get(args) => get::run(args, session).await,
         Command::Describe(args) => describe::run(args, session).await,

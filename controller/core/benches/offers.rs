@@ -126,8 +126,7 @@ fn nearest(robots: usize, queries: usize) {
 }
 
 fn robot(at: Point3<f64>) -> Node {
-    let spec =
-        NodeSpec { kind: NodeKind::Robot, unschedulable: false, taints: Vec::new(), speed: None };
+    let spec = NodeSpec::new(NodeKind::Robot);
     let mut node = Node::new("n", spec);
     let functions = |text| parse_function_list(text).expect("functions").into_iter().collect();
     node.status = Some(NodeStatus {

@@ -10,6 +10,7 @@ use std::sync::Arc;
 
 use muster_api::id::{Epoch, TaskUid};
 use muster_api::kind::lease::DEFAULT_GROUP;
+use muster_api::kind::node::upkeep::passing_taints;
 use muster_api::kind::node::{Node, NodeKind, NodeStatus, RuntimeStatus, Taint};
 use muster_api::kind::quota::QuotaSpec;
 use muster_api::name::{FunctionName, NodeName};
@@ -44,6 +45,10 @@ pub struct NodeFacts {
     pub pose: Option<Pose>,
     /// How tasks can be run.
     pub runtimes: Arc<Vec<RuntimeStatus>>,
+    /// Taints that its conditions put on it for now.
+    pub passing: Vec<Taint>,
+    /// Percent of a full battery; none: it has none, or does not tell.
+    pub battery: Option<u8>,
 }
 
 impl NodeFacts {
@@ -66,6 +71,12 @@ impl NodeFacts {
         if self.actuators.is_empty() { Vec::new() } else { vec![DEFAULT_GROUP.to_owned()] }
     }
 
+    /// What its battery lacks of a full one, percent; nothing without a battery.
+    #[must_use]
+    pub fn battery_lacks(&self) -> u8 {
+        100_u8.saturating_sub(self.battery.unwrap_or(100))
+    }
+
     fn same_but_for_pose(&self, other: &NodeFacts) -> bool {
         self.kind == other.kind
             && self.labels == other.labels
@@ -77,6 +88,8 @@ impl NodeFacts {
             && self.actuators == other.actuators
             && is_move(self.pose.as_ref(), other.pose.as_ref())
             && self.runtimes == other.runtimes
+            && self.passing == other.passing
+            && self.battery == other.battery
     }
 }
 
@@ -115,6 +128,8 @@ impl Models {
             actuators: self.functions.share(status.actuators.iter().cloned().collect()),
             pose: status.pose.clone(),
             runtimes: self.runtimes.share(status.runtimes.clone()),
+            passing: passing_taints(status),
+            battery: status.battery.map(|battery| battery.percent),
         }
     }
 }
@@ -150,8 +165,12 @@ pub struct Member {
     in_order: Option<FreeKey>,
 }
 
-/// Kind, then most free cpu, then most free memory, then the order of joining.
-type FreeKey = (NodeKind, Reverse<MilliCpu>, Reverse<Bytes>, Slot);
+/// Kind, then the fuller battery in steps of [`BATTERY_STEP`], then most free cpu, then most free memory, then the order
+/// of joining.
+type FreeKey = (NodeKind, u8, Reverse<MilliCpu>, Reverse<Bytes>, Slot);
+
+/// Batteries that differ by less are equally full, percent.
+const BATTERY_STEP: u8 = 20;
 
 /// Every node, found by name, by place and by what is free.
 #[derive(Debug, Clone, Default)]
@@ -444,8 +463,10 @@ impl Cluster {
     fn reorder(&mut self, slot: Slot) {
         let member = &mut self.members[slot as usize];
         let free = member.ledger.free();
-        let key =
-            member.facts.as_ref().map(|f| (f.kind, Reverse(free.cpu), Reverse(free.memory), slot));
+        let key = member.facts.as_ref().map(|facts| {
+            let lacks = facts.battery_lacks() / BATTERY_STEP;
+            (facts.kind, lacks, Reverse(free.cpu), Reverse(free.memory), slot)
+        });
         if key == member.in_order {
             return;
         }
@@ -492,10 +513,10 @@ impl Cluster {
         self.members.iter()
     }
 
-    /// Nodes of one kind, most free CR first.
+    /// Nodes of one kind, the fullest batteries first, of those the most free CR.
     pub fn by_free(&self, kind: NodeKind) -> impl Iterator<Item = Slot> {
-        let first = (kind, Reverse(MilliCpu(u64::MAX)), Reverse(Bytes(u64::MAX)), 0);
-        self.by_free.range(first..).take_while(move |key| key.0 == kind).map(|key| key.3)
+        let first = (kind, 0, Reverse(MilliCpu(u64::MAX)), Reverse(Bytes(u64::MAX)), 0);
+        self.by_free.range(first..).take_while(move |key| key.0 == kind).map(|key| key.4)
     }
 
     /// Where the robots are.

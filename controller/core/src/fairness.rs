@@ -20,6 +20,8 @@ pub struct Account {
     pub compute: Compute,
     /// Held leases.
     pub leases: u64,
+    /// Tasks that have reserved something, be it nothing but a place.
+    pub tasks: u64,
 }
 
 /// What every namespace has, and what there is.
@@ -80,7 +82,9 @@ impl Accounts {
         }
         for member in cluster.all() {
             for (_, reservation) in member.ledger.reservations() {
-                accounts.add(namespace_of(&reservation.title), &reservation.compute, 0);
+                let namespace = namespace_of(&reservation.title);
+                accounts.add(namespace, &reservation.compute, 0);
+                accounts.entry(namespace).tasks += 1;
             }
             let holders = member.ledger.groups().filter_map(|(_, group)| group.holder.as_ref());
             for reservation in holders.filter_map(|uid| member.ledger.reservation(uid)) {
@@ -92,12 +96,16 @@ impl Accounts {
 
     /// Counts a new reservation.
     pub fn add(&mut self, namespace: &str, compute: &Compute, leases: u64) {
+        let account = self.entry(namespace);
+        account.compute.add(compute);
+        account.leases += leases;
+    }
+
+    fn entry(&mut self, namespace: &str) -> &mut Account {
         if !self.by_namespace.contains_key(namespace) {
             self.by_namespace.insert(namespace.into(), Account::default());
         }
-        let account = self.by_namespace.get_mut(namespace).expect("it was just put there");
-        account.compute.add(compute);
-        account.leases += leases;
+        self.by_namespace.get_mut(namespace).expect("it was just put there")
     }
 
     /// Takes back what [`Accounts::add`] counted.
@@ -112,15 +120,17 @@ impl Accounts {
     #[must_use]
     pub fn of_quotas(&self, cluster: &Cluster) -> BTreeMap<Arc<str>, QuotaStatus> {
         let status = |(namespace, quota): (&Arc<str>, &QuotaSpec)| {
-            let Account { compute, leases } = self.account(namespace);
+            let Account { compute, leases, tasks } = self.account(namespace);
             let limited = quota.hard.extended.keys().map(|name| (name.clone(), 0));
             let used = Used {
                 cpu: compute.cpu,
                 memory: compute.memory,
                 leases,
+                tasks,
                 extended: limited.chain(compute.extended).collect(),
             };
-            (Arc::clone(namespace), QuotaStatus { hard: quota.hard.clone(), used })
+            let status = QuotaStatus { hard: quota.hard.clone(), used, ..QuotaStatus::default() };
+            (Arc::clone(namespace), status)
         };
         cluster.quotas().map(status).collect()
     }
@@ -223,7 +233,7 @@ mod tests {
         cluster.upsert_node(&name("r"), &node(NodeKind::Robot, 2_000, None));
         let extended = BTreeMap::from([("gpu".to_owned(), 1)]);
         let hard = Limits { cpu: Some(MilliCpu(1_500)), extended, ..Limits::default() };
-        cluster.set_quota("lab", Some(QuotaSpec { hard: hard.clone(), weight: 1.0 }));
+        cluster.set_quota("lab", Some(QuotaSpec { hard: hard.clone(), ..QuotaSpec::default() }));
         let reserve = |cluster: &mut Cluster, title: &str, groups: &[&str]| {
             let compute = Compute::new(MilliCpu(500), Bytes(64));
             let groups = groups.iter().map(|group| (*group).to_owned()).collect();
@@ -236,8 +246,8 @@ mod tests {
         reserve(&mut cluster, "elsewhere/third", &[]);
         let status = |cluster: &Cluster| Accounts::of(cluster).of_quotas(cluster);
         let extended = BTreeMap::from([("gpu".to_owned(), 0)]);
-        let used = Used { cpu: MilliCpu(1_000), memory: Bytes(128), leases: 1, extended };
-        let expected = QuotaStatus { hard, used };
+        let used = Used { cpu: MilliCpu(1_000), memory: Bytes(128), leases: 1, tasks: 2, extended };
+        let expected = QuotaStatus { hard, used, requested: Used::default() };
         assert_eq!(status(&cluster), BTreeMap::from([("lab".into(), expected)]));
         drop(cluster.release(&TaskUid::new("lab/driver")));
         let used = &status(&cluster)["lab"].used;

@@ -14,8 +14,7 @@ pub(crate) fn name(text: &str) -> NodeName {
 
 /// A ready node with 1 GiB; a robot has a camera, a base and an arm.
 pub(crate) fn node(kind: NodeKind, cpu: u64, at: Option<(f64, f64)>) -> Node {
-    let mut node =
-        Node::new("n", NodeSpec { kind, unschedulable: false, taints: Vec::new(), speed: None });
+    let mut node = Node::new("n", NodeSpec::new(kind));
     let robot = kind == NodeKind::Robot;
     let functions = |text| parse_function_list(text).expect("functions").into_iter().collect();
     node.status = Some(NodeStatus {

@@ -17,26 +17,34 @@
 //! | [`schedule`] | where a task goes, or why it goes nowhere (invariant 6) |
 //! | [`preempt`] | who is ended to make room for whom |
 //! | [`offer`] | which frameworks are shown what, and whose Accept passes |
-//! | [`fairness`] | namespaces' shares and quotas |
+//! | [`fairness`] | namespaces' shares, and what their quotas leave of what can be reserved |
+//! | [`quota`] | whether a namespace's quota lets a new task in |
+//! | [`hold`] | why a task is not considered for a place at all |
+//! | [`config`] | what a task gets of ConfigMaps and Secrets |
 //! | [`recent`] | one allocation for what many nodes or tasks have in common |
 //! | [`node_health`] | when a node counts as lost |
 //! | [`taskset`] | which tasks of a TaskSet begin, end and follow each other |
 //! | [`stray`] | what an agent runs and should not |
+//! | [`upkeep`] | when a node is out of service for its battery or for people's work |
 //! | [`report`] | typed reasons, with the words people read |
 #![deny(missing_docs)]
 
 pub mod cluster;
+pub mod config;
 pub mod fairness;
 #[cfg(test)]
 mod fixtures;
+pub mod hold;
 pub mod ledger;
 pub mod node_health;
 pub mod offer;
 pub mod poses;
 pub mod preempt;
+pub mod quota;
 pub mod recent;
 pub mod report;
 pub mod schedule;
 pub mod space;
 pub mod stray;
 pub mod taskset;
+pub mod upkeep;

@@ -92,6 +92,13 @@ pub enum Refusal {
         /// Metres allowed.
         within: f64,
     },
+    /// The robot's battery has less charge than the task asks for.
+    BatteryLow {
+        /// What it has, percent.
+        percent: u8,
+        /// What the task asks for, percent.
+        wanted: u8,
+    },
     /// The cost TravelTime needs a speed.
     NoSpeed,
     /// Less is left than is asked.
@@ -134,6 +141,7 @@ impl Refusal {
             Refusal::NotLocalized => "NotLocalized",
             Refusal::OtherMap { .. } => "OtherMap",
             Refusal::OutOfRange { .. } => "OutOfRange",
+            Refusal::BatteryLow { .. } => "BatteryLow",
             Refusal::NoSpeed => "NoSpeed",
             Refusal::Exhausted { .. } => "Exhausted",
             Refusal::LeaseHeld { .. } => "LeaseHeld",
@@ -219,6 +227,12 @@ impl fmt::Display for Refusal {
                 write!(
                     f,
                     "is {distance:.1} m from the operation position, at most {within:.1} m are allowed"
+                )
+            }
+            Refusal::BatteryLow { percent, wanted } => {
+                write!(
+                    f,
+                    "has {percent} % of its battery, placement.minBattery asks for {wanted} %"
                 )
             }
             Refusal::NoSpeed => f.write_str(

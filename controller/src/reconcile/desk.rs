@@ -33,6 +33,7 @@ use tokio_util::sync::CancellationToken;
 
 use super::bind;
 use crate::context::Context;
+use crate::quota::Pass;
 use crate::session::frameworks::convert;
 use crate::store::{Key, Op, Precondition, StoreError};
 
@@ -167,6 +168,8 @@ pub struct Prepared {
     pub uid: TaskUid,
     /// The offer it uses.
     pub offer: OfferId,
+    /// Through its namespace's quota; kept until it is written or refused.
+    pub(crate) _pass: Option<Pass>,
 }
 
 /// One framework as the desk sees it.

@@ -3,7 +3,7 @@
 //!
 //! | loop | looks at | does |
 //! |---|---|---|
-//! | [`schedule`] | Nodes, Tasks, Leases | binds Pending tasks, orders ends to make room, or writes why not |
+//! | [`schedule`] | Nodes, Tasks, Leases, ConfigMaps, Secrets | binds Pending tasks, orders ends to make room, or writes why not |
 //! | [`deadline`] | Tasks with deadlines | orders the end of those that have run long enough, removes those that ended long ago |
 //! | [`desk`] | frameworks, in [`schedule`]'s own task | shows offers, takes Accepts |
 //! | [`failover`] | Frameworks | removes those that stay away, writes their numbers |
@@ -13,6 +13,7 @@
 //! | [`quotas`] | the scheduler's ledger | writes what namespaces have into Quota status |
 //! | [`health`] | heartbeats | marks silent nodes and their tasks |
 //! | [`taskset`] | TaskSets, their tasks, nodes | begins and ends tasks, changes them, goes back |
+//! | [`upkeep`] | Nodes with batteries and maintenance windows | says when nothing new begins there, ends what is to be gone |
 //! | [`deletion`] | Tasks being deleted | removes those whose processes are gone |
 //! | [`garbage`] | ownerReferences | deletes what lost its owner |
 //! | [`history`] | Events, the store's history | forgets what is old |
@@ -32,6 +33,7 @@ mod preempt;
 pub mod quotas;
 pub mod schedule;
 pub mod taskset;
+pub mod upkeep;
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -85,6 +87,7 @@ pub fn spawn(
     run("deletion", Box::pin(deletion::run(Arc::clone(context))));
     run("garbage", Box::pin(garbage::run(Arc::clone(context))));
     run("taskset", Box::pin(taskset::run(Arc::clone(context))));
+    run("upkeep", Box::pin(upkeep::run(Arc::clone(context))));
     run("history", Box::pin(history::run(Arc::clone(context))));
     run("board", Box::pin(crate::session::board::run(Arc::clone(context), Arc::clone(sessions))));
     run("poses", Box::pin(poses::run(Arc::clone(context), Arc::clone(poses))));

@@ -1,4 +1,5 @@
-//! Writes into the status of Quota objects what their namespaces have, from the scheduler's ledger.
+//! Writes into the status of Quota objects what their namespaces have, from the scheduler's ledger, and what they ask
+//! for, from the door.
 //!
 //! As with `books`: a picture for people and clients, a moment behind. Counting goes over every reservation, so the
 //! scheduler counts at most once in `EVERY`, and what has not changed is not written.
@@ -99,6 +100,8 @@ pub async fn run(context: Arc<Context>, counts: Arc<Counts>) {
 
 async fn write(context: &Context, namespace: &str, status: &QuotaStatus) -> Result<(), StoreError> {
     let key = Key::namespaced(QUOTAS, namespace, QUOTA_NAME);
+    let requested = context.door.requested(&context.store, namespace);
+    let status = &QuotaStatus { requested, ..status.clone() };
     objects::change(&context.store, &key, |stored, object: Quota| {
         if object.status.as_ref() == Some(status) {
             return None;

@@ -4,6 +4,8 @@ use std::sync::Arc;
 
 use axum::response::Response;
 use http::{HeaderValue, StatusCode, header};
+use muster_api::kind::task::Resources;
+use serde::Deserialize as _;
 use serde_json::Value;
 
 use super::path::Object;
@@ -11,7 +13,9 @@ use super::query::FieldValidation;
 use super::registry::Entry;
 use super::{Answer, Call, admission, body, failure::Failure, metadata, namespace};
 use crate::context::Context;
-use crate::store::{Op, Precondition, StoreError, Stored};
+use crate::objects::TASKS;
+use crate::quota::{self, Pass};
+use crate::store::{Op, Precondition, Resource, StoreError, Stored};
 
 /// Random letters after a `generateName`. No vowels and no look-alikes, as in Kubernetes.
 const SUFFIX: &[u8; 27] = b"bcdfghjklmnpqrstvwxz2456789";
@@ -38,7 +42,7 @@ pub(super) async fn create(call: Call, target: Object) -> Answer {
 /// What a client would be told.
 pub async fn create_object(
     context: &Context,
-    resource: crate::store::Resource,
+    resource: Resource,
     object: Value,
 ) -> Result<Arc<Stored>, Failure> {
     let entry = super::registry::of(resource)
@@ -47,6 +51,7 @@ pub async fn create_object(
     let new =
         New { entry, namespace: namespace.as_deref(), mode: FieldValidation::Strict, dry: false };
     let prepared = prepare(context, &new, object)?;
+    let _pass = pass(context, entry.resource, &prepared.object)?;
     commit(context, &new, prepared.object).await
 }
 
@@ -56,7 +61,7 @@ pub async fn create_object(
 /// What a client would be told.
 pub(crate) fn prepare_object(
     context: &Context,
-    resource: crate::store::Resource,
+    resource: Resource,
     object: Value,
 ) -> Result<Value, Failure> {
     let entry = super::registry::of(resource)
@@ -73,12 +78,35 @@ pub(crate) fn prepare_object(
 /// What a client would be told when it is not.
 pub(crate) fn namespace_guard(
     context: &Context,
-    resource: crate::store::Resource,
+    resource: Resource,
     namespace: &str,
 ) -> Result<Option<Op>, Failure> {
     let entry = super::registry::of(resource)
         .ok_or_else(|| Failure::internal(format!("{resource} is not served")))?;
     namespace::admit_into(context, entry, Some(namespace), "")
+}
+
+/// Lets a prepared task through its namespace's quota; to be kept until it is committed. Other kinds pass freely.
+///
+/// # Errors
+/// Everything that the quota does not leave.
+pub(crate) fn pass(
+    context: &Context,
+    resource: Resource,
+    object: &Value,
+) -> Result<Option<Pass>, Failure> {
+    let Some(entry) = super::registry::of(TASKS).filter(|tasks| tasks.resource == resource) else {
+        return Ok(None);
+    };
+    let resources = &object["spec"]["resources"];
+    let resources = match resources {
+        Value::Null => Resources::default(),
+        given => Resources::deserialize(given).map_err(|e| Failure::internal(e.to_string()))?,
+    };
+    let text = |field: &str| metadata::text(object, field).unwrap_or_default();
+    let door = &context.door;
+    door.admit(&context.store, text("namespace"), text("uid"), &resources)
+        .map_err(|violations| Failure::invalid(entry, text("name"), &violations))
 }
 
 /// What is asked for.
@@ -101,8 +129,10 @@ async fn store_new(
             return Err(Failure::already_exists(new.entry, name));
         }
         namespace::admit_into(context, new.entry, new.namespace, name)?;
+        drop(pass(context, new.entry.resource, &prepared.object)?);
         return Ok((prepared.object.to_string().into(), prepared.warnings));
     }
+    let _pass = pass(context, new.entry.resource, &prepared.object)?;
     let stored = commit(context, new, prepared.object).await?;
     Ok((stored.bytes.clone(), prepared.warnings))
 }
@@ -143,6 +173,14 @@ fn prepare(
         }
         _ => {}
     }
+    if new.entry.resource == TASKS
+        && let Some(quota) = new.namespace.and_then(|ns| quota::of(&context.store, ns))
+    {
+        quota::fill_defaults(&quota.defaults, &mut object);
+    }
+    let Some(own) = metadata::of(&mut object) else {
+        return Err(Failure::bad_request("metadata is not a JSON object"));
+    };
     metadata::begin(context, own, !info.group.is_empty());
     if own.get("name").and_then(Value::as_str).is_none_or(str::is_empty)
         && let Some(prefix) = own.get("generateName").and_then(Value::as_str)

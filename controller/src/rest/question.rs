@@ -8,12 +8,14 @@ use muster_api::kind::namespace::DEFAULT;
 use muster_api::kind::task::Task;
 use muster_api::phase::TaskPhase;
 use muster_api::validate::{Violations, element_path};
-use muster_controller_core::schedule::{Demand, Plan};
+use muster_controller_core::hold::Hold;
+use muster_controller_core::schedule::{Demand, Plan, Wait};
 use serde_json::{Value, json};
 
 use super::failure::Failure;
 use super::path::Object;
 use super::{Answer, Call, body, registry};
+use crate::configs;
 use crate::context::{Context, Live};
 use crate::objects;
 
@@ -110,9 +112,32 @@ pub(super) async fn plan(call: Call) -> Answer {
             (d.uid.clone(), json!({ "namespace": namespace, "name": name }))
         })
         .collect();
-    let plan = live(&context)?.scheduler.plan(demands).await.map_err(ended)?;
+    let (held, demands) = hold_back(&context, objects, demands);
+    let mut plan = live(&context)?.scheduler.plan(demands).await.map_err(ended)?;
+    plan.waits.extend(held);
     let answer = describe(&names, &plan, changes, revision);
     Ok(super::json(StatusCode::OK, &answer))
+}
+
+/// Tasks that would not be considered, with their reasons, and the others. ConfigMaps and Secrets that would be applied
+/// with them count as there.
+fn hold_back(
+    context: &Context,
+    objects: &[Value],
+    demands: Vec<Demand>,
+) -> (Vec<Wait>, Vec<Demand>) {
+    let (mut held, mut free) = (Vec::new(), Vec::new());
+    for demand in demands {
+        let (namespace, _) = demand.title.split_once('/').unwrap_or_default();
+        let holds = configs::holds_with(&context.store, objects, namespace, &demand.spec);
+        if holds.is_empty() {
+            free.push(demand);
+        } else {
+            let why = holds.iter().map(Hold::refusal).collect();
+            held.push(Wait { uid: demand.uid, why });
+        }
+    }
+    (held, free)
 }
 
 fn refused(index: usize, violations: Violations) -> Failure {
@@ -136,7 +161,9 @@ fn change_of(context: &Context, object: &Value) -> Result<Value, Failure> {
         let asked = |part: &str| {
             object.pointer(part).is_none_or(|o| present.pointer(part).is_some_and(|p| holds(p, o)))
         };
-        ["/spec", "/metadata/labels", "/metadata/annotations"].iter().all(|part| asked(part))
+        let values = ["/data", "/binaryData", "/type", "/immutable"];
+        let parts = ["/spec", "/metadata/labels", "/metadata/annotations"].into_iter();
+        parts.chain(values).all(asked)
     };
     let action = match &present {
         None => "create",

@@ -290,6 +290,7 @@ mod tests {
             kubeconfig: dir.path().join("kubeconfig"),
             kubeconfig_asked: true,
             advertise: Vec::new(),
+            encryption_key: None,
         };
         let (store, address) = (crate::store::memory::start().await, config.listen);
         let (events, _) = Recorder::new();

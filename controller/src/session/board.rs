@@ -13,13 +13,18 @@ use muster_api::kind::task::{Task, TaskStatus};
 use muster_api::name::NodeName;
 use muster_api::wire::agent::v1 as wire;
 use muster_api::wire::agent_session::spec_to_wire;
+use prost::Message as _;
 use tokio::sync::Notify;
 
 use super::{Sessions, lock};
+use crate::configs;
 use crate::context::Context;
 use crate::objects::{self, TASKS};
 use crate::reconcile::{next_events, watch_from_now};
-use crate::store::{Change, Key, Stored};
+use crate::store::{Change, Key, Store, Stored};
+
+/// Most bytes of assignments in one message; a single one may be larger, and is still less than a message takes.
+const PART: usize = 1 << 20;
 
 /// What a node should have.
 #[derive(Debug, Default)]
@@ -35,8 +40,19 @@ struct Pages {
     by_node: HashMap<NodeName, Page>,
     /// Every placed task: where it is and what its object is called.
     tasks: HashMap<TaskUid, (NodeName, Key)>,
+    /// Which placed tasks name a ConfigMap or a Secret, by the object's key.
+    users: HashMap<Key, BTreeSet<TaskUid>>,
     /// The store was looked at since the start; before that, "not here" means nothing.
     filled: bool,
+}
+
+impl Pages {
+    fn forget_user(&mut self, uid: &TaskUid) {
+        self.users.retain(|_, users| {
+            users.remove(uid);
+            !users.is_empty()
+        });
+    }
 }
 
 /// Assignments by node.
@@ -79,7 +95,7 @@ impl Board {
         page.changed.clear();
         let upserts = page.assignments.values().cloned().collect();
         (
-            wire::Assignments { complete: true, upserts, released: Vec::new() },
+            wire::Assignments { complete: true, upserts, ..wire::Assignments::default() },
             Arc::clone(&page.wake),
         )
     }
@@ -96,17 +112,37 @@ impl Board {
             }
         }
         let something = !upserts.is_empty() || !released.is_empty();
-        something.then_some(wire::Assignments { complete: false, upserts, released })
+        something.then_some(wire::Assignments { upserts, released, ..Default::default() })
     }
 
-    fn take_in(&self, change: Change, stored: &Stored) {
+    /// A ConfigMap or a Secret changed: what placed tasks get of it is looked up again. Their attempts keep what they
+    /// have; the agents keep the new values for the next ones.
+    fn source_changed(&self, store: &Store, source: &Key) {
+        let users = lock(&self.pages).users.get(source).cloned().unwrap_or_default();
+        for uid in users {
+            let Some((_, key)) = self.find(uid.as_str()) else { continue };
+            if let Some(stored) = store.get(&key).filter(|stored| *stored.uid == *uid.as_str()) {
+                self.take_in(store, Change::Put, &stored);
+            }
+        }
+    }
+
+    fn take_in(&self, store: &Store, change: Change, stored: &Stored) {
         let uid = TaskUid::new(&*stored.uid);
         // A task that was never placed is not read: there may be thousands that wait.
         let read = change == Change::Put && stored.mentions("boundAt");
         let task = read.then(|| objects::read::<Task>(stored)).flatten();
         let placed = task.and_then(|task| {
             let node = NodeName::new(task.status.as_ref()?.node.clone()?).ok()?;
-            Some((node, assignment(&task)))
+            let sources = task.spec.references().into_iter();
+            let namespace = stored.key.namespace().unwrap_or_default();
+            let sources: Vec<Key> =
+                sources.map(|(source, name)| configs::key_of(source, namespace, name)).collect();
+            // Known as a user before the look: a change after it looks again.
+            for source in sources {
+                lock(&self.pages).users.entry(source).or_default().insert(uid.clone());
+            }
+            Some((node, assignment(store, &task)))
         });
         let mut pages = lock(&self.pages);
         match placed {
@@ -122,6 +158,7 @@ impl Board {
             }
             None => {
                 let Some((node, _)) = pages.tasks.remove(&uid) else { return };
+                pages.forget_user(&uid);
                 let page = pages.by_node.entry(node).or_default();
                 page.assignments.remove(&uid);
                 page.changed.insert(uid);
@@ -141,6 +178,7 @@ impl Board {
             .collect();
         for (uid, node) in gone {
             pages.tasks.remove(&uid);
+            pages.forget_user(&uid);
             let page = pages.by_node.entry(node).or_default();
             page.assignments.remove(&uid);
             page.changed.insert(uid);
@@ -152,8 +190,12 @@ impl Board {
 }
 
 /// What the agent of its node gets of a placed task.
-fn assignment(task: &Task) -> wire::Assignment {
+fn assignment(store: &Store, task: &Task) -> wire::Assignment {
     let status = task.status.clone().unwrap_or_default();
+    let namespace = task.metadata.namespace.clone().unwrap_or_default();
+    let ended = status.phase.is_terminal();
+    // What has ended needs nothing any more.
+    let config = (!ended).then(|| configs::to_wire(store, &namespace, &task.spec)).flatten();
     let deleted = task.metadata.deletion_timestamp.is_some().then(|| "Deleted".to_owned());
     let ordered = || status.stop.as_ref().map(|stop| format!("{}: {}", stop.reason, stop.message));
     let stop = deleted
@@ -161,12 +203,13 @@ fn assignment(task: &Task) -> wire::Assignment {
         .map(|reason| wire::Stop { grace_period_ms: grace_ms(task), reason });
     wire::Assignment {
         uid: objects::uid_of(&task.metadata).to_owned(),
-        namespace: task.metadata.namespace.clone().unwrap_or_default(),
+        namespace,
         name: task.metadata.name.clone().unwrap_or_default(),
         spec: spec_to_wire(&task.spec),
         lease: lease_token(&status),
         stop,
-        ended: status.phase.is_terminal(),
+        ended,
+        config,
         framework: super::frameworks::owning(&task.metadata)
             .map(|o| wire::Framework { id: o.uid.clone(), name: o.name.clone() }),
     }
@@ -190,6 +233,27 @@ fn lease_token(status: &TaskStatus) -> Option<wire::LeaseToken> {
     })
 }
 
+/// The same as messages that a session takes. All but the last are parts, and the last one names what they brought.
+pub(super) fn split(page: wire::Assignments) -> Vec<wire::Assignments> {
+    let wire::Assignments { complete, upserts, released, mut kept } = page;
+    let (mut parts, mut part, mut bytes) = (Vec::new(), Vec::new(), 0);
+    for upsert in upserts {
+        let more = upsert.encoded_len();
+        if bytes + more > PART && !part.is_empty() {
+            let full: Vec<wire::Assignment> = std::mem::take(&mut part);
+            if complete {
+                kept.extend(full.iter().map(|a| a.uid.clone()));
+            }
+            parts.push(wire::Assignments { upserts: full, ..Default::default() });
+            bytes = 0;
+        }
+        bytes += more;
+        part.push(upsert);
+    }
+    parts.push(wire::Assignments { complete, upserts: part, released, kept });
+    parts
+}
+
 /// Keeps the board like the store, until dropped.
 pub async fn run(context: Arc<Context>, sessions: Arc<Sessions>) {
     let board = sessions.board();
@@ -197,13 +261,41 @@ pub async fn run(context: Arc<Context>, sessions: Arc<Sessions>) {
         let mut watcher = watch_from_now(&context.store).await;
         let snapshot = context.store.list(TASKS, None).items;
         for stored in &snapshot {
-            board.take_in(Change::Put, stored);
+            board.take_in(&context.store, Change::Put, stored);
         }
         board.keep_only(&snapshot.iter().map(|s| TaskUid::new(&*s.uid)).collect());
         while let Some(events) = next_events(&mut watcher).await {
-            for event in events.iter().filter(|e| e.object.key.resource == TASKS) {
-                board.take_in(event.change, &event.object);
+            for event in &events {
+                let key = &event.object.key;
+                if key.resource == TASKS {
+                    board.take_in(&context.store, event.change, &event.object);
+                } else if configs::is_source(key.resource) {
+                    board.source_changed(&context.store, key);
+                }
             }
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_page_that_is_too_long_for_one_message_is_still_whole() {
+        let assignment = |uid: &str| wire::Assignment {
+            uid: uid.to_owned(),
+            spec: vec![0; PART / 2 + 1],
+            ..wire::Assignment::default()
+        };
+        let upserts = ["a", "b", "c"].map(assignment).to_vec();
+        let page = wire::Assignments { complete: true, upserts, ..Default::default() };
+        let parts = split(page.clone());
+        let told: Vec<(bool, usize)> =
+            parts.iter().map(|p| (p.complete, p.upserts.len())).collect();
+        assert_eq!(told, [(false, 1), (false, 1), (true, 1)]);
+        assert_eq!(parts[2].kept, ["a", "b"]);
+        let small = wire::Assignments { upserts: Vec::new(), ..page };
+        assert_eq!(split(small.clone()), [small]);
     }
 }

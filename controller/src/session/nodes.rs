@@ -139,6 +139,7 @@ fn fill(context: &Context, speaker: &Speaker, report: &NodeReport, node: &mut No
     status.incarnation = Some(speaker.incarnation.clone());
     status.agent_version.clone_from(&speaker.version);
     status.address.clone_from(&report.address);
+    status.battery = report.battery;
     if let Some(pose) = &report.pose
         && status
             .pose
@@ -151,7 +152,7 @@ fn fill(context: &Context, speaker: &Speaker, report: &NodeReport, node: &mut No
         set_condition(&mut status.conditions, condition.clone(), &Time(now));
     }
     let said: Vec<&str> = report.conditions.iter().map(|c| c.r#type.as_str()).collect();
-    let ours = [condition::READY, condition::FENCED];
+    let ours = [condition::READY, condition::FENCED, condition::BATTERY, condition::MAINTENANCE];
     status.conditions.retain(|c| ours.iter().chain(&said).any(|known| *known == c.r#type.as_str()));
 }
 

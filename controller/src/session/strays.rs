@@ -14,7 +14,7 @@ use tokio::sync::Notify;
 use wire::controller_message::Body as ToAgent;
 
 use super::agents::{End, Session, internal};
-use super::nodes;
+use super::{board, nodes};
 use crate::objects;
 
 impl Session {
@@ -26,8 +26,15 @@ impl Session {
         let over = told.iter().filter(|report| !lives(report) && !named(&report.uid));
         page.released = over.map(|report| report.uid.clone()).collect();
         self.hold_back(&mut page);
-        self.send(ToAgent::Assignments(page)).await?;
+        self.send_assignments(page).await?;
         Ok(wake)
+    }
+
+    async fn send_assignments(&self, page: wire::Assignments) -> Result<(), End> {
+        for part in board::split(page) {
+            self.send(ToAgent::Assignments(part)).await?;
+        }
+        Ok(())
     }
 
     /// While something runs that should not, nothing new is sent.
@@ -96,7 +103,7 @@ impl Session {
         // What lives is not released: its end is still to be heard.
         changed.released.retain(|uid| !self.strays.lives(&TaskUid::new(uid.clone())));
         self.hold_back(&mut changed);
-        self.send(ToAgent::Assignments(changed)).await
+        self.send_assignments(changed).await
     }
 
     /// Takes a report, and what it says about strays.
@@ -107,7 +114,7 @@ impl Session {
         let placed = self.sessions.board().find(&report.uid);
         if !lives && placed.is_none_or(|(node, _)| node != self.node) {
             let released = vec![report.uid.clone()];
-            let over = wire::Assignments { complete: false, upserts: Vec::new(), released };
+            let over = wire::Assignments { released, ..wire::Assignments::default() };
             self.send(ToAgent::Assignments(over)).await?;
         }
         let assigned = !lives || self.strays.lives(&uid) || self.is_assigned(&uid);

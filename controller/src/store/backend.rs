@@ -5,7 +5,6 @@ use futures::future::BoxFuture;
 use super::Event;
 
 /// One row of history as it was committed.
-#[derive(Debug)]
 pub(super) struct Row {
     pub(super) revision: u64,
     pub(super) resource: String,
@@ -46,6 +45,9 @@ pub enum BackendError {
     /// The rows contradict each other.
     #[error("the database is damaged: {0}")]
     Damaged(String),
+    /// A Secret cannot be sealed or opened.
+    #[error(transparent)]
+    Sealed(#[from] super::seal::SealError),
     /// A test asked for it.
     #[error("injected failure")]
     Injected,

@@ -38,7 +38,7 @@ impl Running {
 
     async fn small(path: &Path, events: usize) -> Self {
         let limits = RingLimits { events, bytes: 1 << 20 };
-        Self::new(sqlite::open_with(path, limits).await.unwrap())
+        Self::new(sqlite::open_with(path, &path.with_file_name("keys"), limits).await.unwrap())
     }
 
     async fn shut_down(self) {
@@ -437,6 +437,77 @@ async fn a_newer_schema_is_refused() {
     .unwrap();
     let refused = sqlite::open(&path).await.unwrap_err();
     assert!(matches!(refused, OpenError::Newer { found: 99, supported: 1, .. }), "{refused:?}");
+}
+
+const SECRETS: Resource = Resource::new("secrets");
+
+fn secret(password: &str) -> Value {
+    json!({"metadata": {"name": "s", "uid": "u"}, "data": {"password": password}})
+}
+
+/// Where a text stands in the files of a directory.
+fn files_with(dir: &Path, text: &str) -> Vec<std::path::PathBuf> {
+    let all = std::fs::read_dir(dir).unwrap().map(|entry| entry.unwrap().path());
+    let has = |path: &std::path::PathBuf| {
+        let bytes = std::fs::read(path).unwrap();
+        bytes.windows(text.len()).any(|window| window == text.as_bytes())
+    };
+    all.filter(has).collect()
+}
+
+#[tokio::test]
+async fn secrets_are_sealed_on_disk_and_their_keys_can_be_rotated() {
+    let dir = tempfile::tempdir().unwrap();
+    let (path, keys) = (dir.path().join("db"), dir.path().join(sqlite::KEY_FILE));
+    let key = Key::namespaced(SECRETS, "default", "s");
+    let running = Running::sqlite(&path).await;
+    for password in ["hunter-one", "hunter-two"] {
+        let put =
+            Op::Put { key: key.clone(), value: secret(password), precondition: Precondition::Any };
+        running.store.apply_one(put).await.unwrap();
+    }
+    assert_eq!(files_with(dir.path(), "hunter"), Vec::<std::path::PathBuf>::new());
+    running.shut_down().await;
+
+    let old = std::fs::read_to_string(&keys).unwrap();
+    // A key that is gone, and a wrong one: nothing is lost, and both are said.
+    std::fs::remove_file(&keys).unwrap();
+    let missing = sqlite::open(&path).await.unwrap_err();
+    assert!(matches!(missing, OpenError::Keys(seal::SealError::Missing { .. })), "{missing}");
+    let line = old.lines().last().unwrap();
+    let new =
+        if line.starts_with('A') { line.replacen('A', "B", 1) } else { format!("A{}", &line[1..]) };
+    let write = |text: &str| {
+        std::fs::write(&keys, text).unwrap();
+        use std::os::unix::fs::PermissionsExt as _;
+        std::fs::set_permissions(&keys, std::fs::Permissions::from_mode(0o600)).unwrap();
+    };
+    write(&new);
+    let wrong = sqlite::open(&path).await.unwrap_err();
+    let OpenError::Backend { source: BackendError::Sealed(source), .. } = &wrong else {
+        panic!("{wrong:?}")
+    };
+    assert!(matches!(source, seal::SealError::WrongKey { .. }), "{source}");
+
+    // Both: old rows are written anew, and then the old key is not needed.
+    let id = |at: &Path| {
+        let bytes = std::fs::read(at).unwrap();
+        let text = String::from_utf8_lossy(&bytes).into_owned();
+        text.match_indices("sealed:v1:")
+            .map(|(i, m)| text[i + m.len()..][..16].to_owned())
+            .collect::<std::collections::BTreeSet<_>>()
+    };
+    let before = id(&path);
+    write(&format!("{new}\n{old}"));
+    Running::sqlite(&path).await.shut_down().await;
+    write(&new);
+    let running = Running::sqlite(&path).await;
+    let stored = running.store.get(&key).unwrap();
+    assert_eq!(stored.value()["data"]["password"], "hunter-two");
+    running.shut_down().await;
+    let after = id(&path);
+    assert_eq!(after.len(), 1, "{after:?}");
+    assert!(before.is_disjoint(&after), "{before:?} {after:?}");
 }
 
 async fn connect(path: &Path) -> sqlx::SqliteConnection {

@@ -89,6 +89,9 @@ pub enum OpenError {
         /// The newest that this binary knows.
         supported: i64,
     },
+    /// The keys of its Secrets cannot be used.
+    #[error(transparent)]
+    Keys(super::seal::SealError),
     /// It could not be opened, migrated or read.
     #[error("cannot open the store at {}", path.display())]
     Backend {

@@ -17,6 +17,7 @@
 //! | `watch` | cursors over the ring |
 //! | `document` | JSON with its resourceVersion spliced in |
 //! | `backend`, [`sqlite`], [`memory`] | where a batch becomes durable |
+//! | [`seal`] | Secrets are encrypted before they reach a disk |
 //! | `contract` | the one suite that both backends pass |
 //!
 //! Reads never touch the disk: every live object is in memory as the JSON that was committed. A write is answered
@@ -33,11 +34,13 @@ pub mod memory;
 mod pending;
 #[cfg(test)]
 mod properties;
+pub mod seal;
 pub mod sqlite;
 mod state;
 mod watch;
 mod writer;
 
+use std::fmt;
 use std::sync::Arc;
 
 use bytes::Bytes;
@@ -54,8 +57,8 @@ pub use state::{Expired, Snapshot};
 pub use watch::{WatchEnd, WatchError, Watcher};
 pub use writer::Writer;
 
-/// One object as it was committed.
-#[derive(Debug, Clone, PartialEq, Eq)]
+/// One object as it was committed. What is in it is not shown in logs.
+#[derive(Clone, PartialEq, Eq)]
 pub struct Stored {
     /// Where the object lives.
     pub key: Key,
@@ -65,6 +68,16 @@ pub struct Stored {
     pub uid: Box<str>,
     /// The object as JSON, ready to be sent.
     pub bytes: Bytes,
+}
+
+impl fmt::Debug for Stored {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Stored")
+            .field("key", &self.key)
+            .field("revision", &self.revision)
+            .field("uid", &self.uid)
+            .finish_non_exhaustive()
+    }
 }
 
 impl Stored {
@@ -135,8 +148,9 @@ impl Precondition {
     }
 }
 
-/// One change of one object. A transaction is a `Vec<Op>` and is applied whole or not at all.
-#[derive(Debug, Clone)]
+/// One change of one object. A transaction is a `Vec<Op>` and is applied whole or not at all. As with [`Stored`], what
+/// is written is not shown.
+#[derive(Clone)]
 pub enum Op {
     /// Create or replace an object. `metadata.resourceVersion` in `value` is ignored and set by the store.
     Put {
@@ -168,6 +182,18 @@ pub enum Op {
         /// What must hold.
         precondition: Precondition,
     },
+}
+
+impl fmt::Debug for Op {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let (what, key) = match self {
+            Op::Put { key, .. } => ("Put", key),
+            Op::Status { of, .. } => ("Status", &of.key),
+            Op::Check { key, .. } => ("Check", key),
+            Op::Delete { key, .. } => ("Delete", key),
+        };
+        f.debug_tuple(what).field(key).finish()
+    }
 }
 
 impl Op {

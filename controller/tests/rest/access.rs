@@ -112,6 +112,7 @@ async fn a_second_controller_on_the_same_directory_is_refused() {
         kubeconfig: cluster.dir.path().join("other"),
         kubeconfig_asked: true,
         advertise: Vec::new(),
+        encryption_key: None,
     };
     let refused = app::start(config).await.unwrap_err();
     assert!(matches!(refused, app::AppError::Locked { .. }), "{refused}");

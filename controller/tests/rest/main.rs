@@ -3,10 +3,12 @@
 
 mod access;
 mod agent;
+mod config;
 mod fencing;
 mod fleet;
 mod objects;
 mod poses;
+mod quotas;
 mod removal;
 mod support;
 mod watching;

@@ -101,6 +101,7 @@ fn config(dir: &TempDir) -> Config {
         kubeconfig: dir.path().join("kubeconfig"),
         kubeconfig_asked: true,
         advertise: Vec::new(),
+        encryption_key: None,
     }
 }
 

@@ -118,6 +118,7 @@ pub(crate) async fn queue() {
             kubeconfig: dir.path().join("kubeconfig"),
             kubeconfig_asked: true,
             advertise: Vec::new(),
+            encryption_key: None,
         };
         let running = app::start(config).await.expect("a controller");
         let store = running.context().store.clone();

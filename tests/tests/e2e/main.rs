@@ -1,6 +1,7 @@
 //! The main job with real processes, cgroups, SQLite and Docker.
 
 mod cli;
+mod config;
 mod demo;
 mod examples;
 mod fence;
@@ -13,3 +14,4 @@ mod probes;
 mod quotas;
 mod survival;
 mod tasksets;
+mod upkeep;

@@ -47,6 +47,9 @@ pub(super) fn body(launch: &Launch, config: &DockerConfig) -> Result<ContainerCr
     env.insert("MUSTER_RUN_DIR".to_owned(), RUN_DIR.to_owned());
     let socket = format!("{EXECUTOR_DIR}/{}", executor::SOCKET);
     env.insert(executor::SOCKET_ENV.to_owned(), socket);
+    // Who may use the engine sees them, as everything of a container.
+    let given = launch.given.iter().flat_map(|given| &given.variables);
+    env.extend(given.map(|variable| (variable.name.clone(), variable.value.clone())));
     let list = |words: &[String]| if words.is_empty() { None } else { Some(words.to_vec()) };
     Ok(ContainerCreateBody {
         image: Some(container.image.clone()),
@@ -83,6 +86,8 @@ fn host(
         mounts.push(mount(&seat.display().to_string(), EXECUTOR_DIR, true));
     }
     mounts.extend(container.mounts.iter().map(|m| mount(&m.host, &m.container, m.read_only)));
+    let files = config.files.bound(launch);
+    mounts.extend(files.iter().map(|f| mount(&f.host.display().to_string(), &f.container, true)));
     let throttle = |bps: Option<u64>| -> Result<Option<Vec<ThrottleDevice>>, Failure> {
         let Some(bps) = bps else { return Ok(None) };
         let path = disk(config)?;
@@ -138,6 +143,12 @@ pub(super) fn update(limits: &Limits) -> ContainerUpdateBody {
     }
 }
 
+/// `uid` or `uid:gid` of an image; names mean something inside of it only.
+pub(super) fn user_ids(user: &str) -> Option<(u32, u32)> {
+    let (uid, gid) = user.split_once(':').unwrap_or((user, "0"));
+    Some((uid.parse().ok()?, gid.parse().ok()?))
+}
+
 fn mount(source: &str, target: &str, read_only: bool) -> Mount {
     Mount {
         source: Some(source.to_owned()),
@@ -176,6 +187,14 @@ pub(super) fn image_and_tag(image: &str) -> (&str, &str) {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn users_by_number() {
+        assert_eq!(user_ids("1000"), Some((1000, 0)));
+        assert_eq!(user_ids("1000:50"), Some((1000, 50)));
+        assert_eq!(user_ids("node"), None);
+        assert_eq!(user_ids(""), None);
+    }
 
     #[test]
     fn images_and_tags() {

@@ -3,7 +3,7 @@
 
 use std::io;
 use std::path::PathBuf;
-use std::process::Child;
+use std::process::{Child, Stdio};
 
 use super::DockerConfig;
 use crate::durable;
@@ -44,7 +44,7 @@ pub(super) async fn start(
         let Some(lock) = dir.lock().map_err(failed)? else { return Ok(None) };
         dir.write_order(&order).map_err(failed)?;
         let null = std::fs::File::options().write(true).open("/dev/null")?;
-        spawn_shim(&reexec, &dir, &lock, null.into()).map(Some)
+        spawn_shim(&reexec, &dir, &lock, (Stdio::null(), null.into())).map(Some)
     })
     .await?
 }

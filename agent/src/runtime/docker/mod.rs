@@ -46,6 +46,7 @@ use super::{
 };
 use crate::clock;
 use crate::driver::chain;
+use crate::given::files::Place;
 use crate::runtime::launch::{Container, Network, Program, Pull};
 use engine::Engine;
 use inspect::Seen;
@@ -59,6 +60,7 @@ pub(crate) struct DockerConfig {
     pub(crate) identity: String,
     /// Holds `<uid>/run`, which containers see.
     pub(crate) tasks: PathBuf,
+    pub(crate) files: Place,
     pub(crate) reexec: Reexec,
     pub(crate) contact: PathBuf,
 }
@@ -157,7 +159,9 @@ impl DockerRuntime {
             Err(error) => return Launched::Refused(self.unavailable(&error)),
         };
         let name = self.name(&launch.id);
-        let body = match create::body(launch, &self.0.config) {
+        let launch = &self.with_user(&docker, launch).await;
+        let written = self.0.config.files.write(launch, None);
+        let body = match written.and_then(|()| create::body(launch, &self.0.config)) {
             Ok(body) => body,
             Err(failure) => return Launched::Refused(failure),
         };
@@ -180,6 +184,19 @@ impl DockerRuntime {
             };
         }
         self.start(&docker, &name, launch).await
+    }
+
+    /// The launch with the image's user, when there are files to be handed over to it. An image that is missing shows
+    /// when the container is created.
+    async fn with_user(&self, docker: &Docker, launch: &Launch) -> Launch {
+        let mut launch = launch.clone();
+        let files = launch.given.as_ref().is_some_and(|given| !given.files.is_empty());
+        if let (Program::Container(container), true) = (&mut launch.program, files) {
+            let image = docker.inspect_image(&container.image).await.ok();
+            let user = image.and_then(|image| image.config?.user).unwrap_or_default();
+            container.user = create::user_ids(&user);
+        }
+        launch
     }
 
     async fn start(&self, docker: &Docker, name: &str, launch: &Launch) -> Launched {

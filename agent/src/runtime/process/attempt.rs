@@ -2,7 +2,7 @@
 //!
 //! | file | written by | says |
 //! |---|---|---|
-//! | `launch.json` | agent | what to start, in which group |
+//! | `launch.json` | agent | what to start, in which group; without what it is given of ConfigMaps and Secrets |
 //! | `lock` | agent, inherited by the shim | held: the shim lives (or is about to) |
 //! | `begun.json` | shim | a process may have been started from here on |
 //! | `started.json` | shim | the program runs |

@@ -2,6 +2,7 @@
 //! group when it is over or is to be over: forks and control groups take milliseconds that the agent's one thread has
 //! not, and the program is tied to that thread, so that it does not outlive an agent that is killed.
 
+use std::collections::BTreeMap;
 use std::io;
 use std::os::fd::{AsFd, OwnedFd};
 use std::os::unix::process::ExitStatusExt;
@@ -15,7 +16,7 @@ use rustix::process::{Pid, PidfdFlags, Signal};
 use tokio::sync::oneshot;
 
 use super::attempt::{AttemptDir, Order};
-use crate::runtime::{Executed, KEPT_WORDS, RuntimeError};
+use crate::runtime::{Executed, KEPT_WORDS, Launch, RuntimeError};
 use crate::shim::start::{self, StartError};
 
 const WHAT: &str = "run a program beside a task";
@@ -28,6 +29,7 @@ const STACK: usize = 256 << 10;
 
 pub(super) async fn exec(
     dir: AttemptDir,
+    launch: &Launch,
     argv: &[String],
     until: BoxFuture<'_, ()>,
 ) -> Result<Executed, RuntimeError> {
@@ -35,11 +37,14 @@ pub(super) async fn exec(
         .map_err(|errno| RuntimeError::new(WHAT, errno))?;
     let (answer, mut answered) = oneshot::channel();
     let argv = argv.to_vec();
+    // The order on disk is without them.
+    let given = launch.given.iter().flat_map(|given| &given.variables);
+    let given = given.map(|v| (v.name.clone(), v.value.clone())).collect();
     std::thread::Builder::new()
         .name("check".to_owned())
         .stack_size(STACK)
         // Whoever asked may be gone: then its end of `cut` is closed, and the thread ends soon.
-        .spawn(move || answer.send(run(&dir, &argv, &cut)))
+        .spawn(move || answer.send(run(&dir, &given, &argv, &cut)))
         .map_err(|error| RuntimeError::new(WHAT, error))?;
     // Cancel-safe: dropped whole, which closes `keep` and so kills the program.
     let done = tokio::select! {
@@ -54,7 +59,12 @@ pub(super) async fn exec(
     done.unwrap_or_else(|error| Err(RuntimeError::new(WHAT, error)))
 }
 
-fn run(dir: &AttemptDir, argv: &[String], cut: &OwnedFd) -> Result<Executed, RuntimeError> {
+fn run(
+    dir: &AttemptDir,
+    given: &BTreeMap<String, String>,
+    argv: &[String],
+    cut: &OwnedFd,
+) -> Result<Executed, RuntimeError> {
     let failed = |error: io::Error| RuntimeError::new(WHAT, error);
     let order = dir.order().map_err(|error| RuntimeError::new(WHAT, error))?;
     let order: Order = order.ok_or_else(|| RuntimeError::new(WHAT, "it has no order"))?;
@@ -63,7 +73,7 @@ fn run(dir: &AttemptDir, argv: &[String], cut: &OwnedFd) -> Result<Executed, Run
     // Only the reading end may refuse to wait.
     rustix::io::ioctl_fionbio(&child_output, false).map_err(|errno| failed(errno.into()))?;
     let both = (child_output.try_clone().map_err(failed)?, child_output);
-    let child = match start::spawn(&order, argv, both, true) {
+    let child = match start::spawn(&order, given, argv, both, true) {
         Ok(child) => child,
         Err(error @ StartError::Order(_)) => return Ok(Executed::NotStarted(error.to_string())),
         Err(error) => return Err(failed(io::Error::other(error.to_string()))),

@@ -50,6 +50,7 @@ use super::launch::{AttemptId, Launch, Limits, Used};
 use super::{Executed, Launched, LogQuery, Runtime, RuntimeError, RuntimeStatus, logs};
 use crate::clock;
 use crate::durable::FileError;
+use crate::given::files::Place;
 use attempt::{AttemptDir, LogBounds, Process, StopFile};
 use reach::{Ladder, Reach};
 
@@ -81,6 +82,7 @@ impl Reexec {
 pub(crate) struct ProcessConfig {
     /// Holds `<uid>/attempts/<n>` and `<uid>/work`.
     pub(crate) tasks: PathBuf,
+    pub(crate) files: Place,
     pub(crate) reexec: Reexec,
     pub(crate) contact: PathBuf,
     pub(crate) log: LogBounds,
@@ -417,7 +419,7 @@ impl Runtime for ProcessRuntime {
         argv: &'a [String],
         until: BoxFuture<'a, ()>,
     ) -> BoxFuture<'a, Result<Executed, RuntimeError>> {
-        exec::exec(self.0.dir(&launch.id), argv, until).boxed()
+        exec::exec(self.0.dir(&launch.id), launch, argv, until).boxed()
     }
 
     fn remove<'a>(&'a self, uid: &'a TaskUid) -> BoxFuture<'a, Result<(), RuntimeError>> {

@@ -1,7 +1,8 @@
 //! From a launch to a shim: directory, group, lock, fork. All before the fork can be taken back.
 
-use std::fs;
-use std::io;
+use std::collections::BTreeMap;
+use std::fs::{self, File};
+use std::io::{self, Seek as _, Write as _};
 use std::os::fd::{AsFd, AsRawFd, OwnedFd};
 use std::os::unix::fs::DirBuilderExt;
 use std::os::unix::process::CommandExt;
@@ -10,11 +11,13 @@ use std::process::{Child, Command, Stdio};
 use std::sync::Arc;
 
 use muster_agent_core::workload::Failure;
+use rustix::fs::{MemfdFlags, memfd_create};
 use rustix::pipe::PipeFlags;
 
 use super::attempt::{AttemptDir, Order};
 use super::{Inner, KEPT_ATTEMPTS, Live, Reexec, Word, pidfd, scan};
 use crate::durable::FileError;
+use crate::given::files::DIR_ENV;
 use crate::runtime::RuntimeError;
 use crate::runtime::cgroup::group::Group;
 use crate::runtime::launch::{Launch, Program};
@@ -42,7 +45,7 @@ fn files(error: &FileError) -> SpawnError {
     refused("NodeError", format!("{error}: {}", error.source), true)
 }
 
-pub(super) fn spawn(inner: &Inner, launch: Launch) -> Result<Spawned, SpawnError> {
+pub(super) fn spawn(inner: &Inner, mut launch: Launch) -> Result<Spawned, SpawnError> {
     let dir = make_dirs(inner, &launch).map_err(|error| files(&error))?;
     let lock = match dir.lock() {
         Ok(Some(lock)) => lock,
@@ -52,6 +55,9 @@ pub(super) fn spawn(inner: &Inner, launch: Launch) -> Result<Spawned, SpawnError
     if !matches!((dir.begun(), dir.exit()), (Ok(None), Ok(None))) {
         return Err(unclear("start an attempt", "it was started before"));
     }
+    hand_files(inner, &mut launch)?;
+    let given = variables(&launch)
+        .map_err(|error| refused("NodeError", format!("no memory for variables: {error}"), true))?;
     let group = make_group(inner, &launch)?;
     let order = Order {
         work_dir: inner.work_dir(&launch.id.uid),
@@ -74,9 +80,10 @@ pub(super) fn spawn(inner: &Inner, launch: Launch) -> Result<Spawned, SpawnError
         .map_err(|errno| give_up(refused("NodeError", format!("no pipe: {errno}"), true)))?;
     // Only the reading end may refuse to wait.
     let _ = rustix::io::ioctl_fionbio(&child_word, false);
-    let child = spawn_shim(&inner.config.reexec, &dir, &lock, child_word).map_err(|error| {
-        give_up(refused("NodeError", format!("failed to start a shim: {error}"), true))
-    })?;
+    let child =
+        spawn_shim(&inner.config.reexec, &dir, &lock, (given, child_word)).map_err(|error| {
+            give_up(refused("NodeError", format!("failed to start a shim: {error}"), true))
+        })?;
     // From here on the shim holds the lock as well.
     drop(lock);
     let pid = child.id().cast_signed();
@@ -86,6 +93,35 @@ pub(super) fn spawn(inner: &Inner, launch: Launch) -> Result<Spawned, SpawnError
     };
     let reach = crate::shim::reach(&order, pid, None);
     Ok(Spawned { live: Live { shim: Arc::new(shim), reach }, word: Word(word) })
+}
+
+/// Files of ConfigMaps and Secrets, and where they are.
+fn hand_files(inner: &Inner, launch: &mut Launch) -> Result<(), SpawnError> {
+    let work = inner.work_dir(&launch.id.uid);
+    let links = match &launch.program {
+        Program::Process { working_dir: None, .. } => Some(work.as_path()),
+        _ => None,
+    };
+    let files = &inner.config.files;
+    files.write(launch, links).map_err(SpawnError::Refused)?;
+    if let Some(given) = launch.given.as_ref().filter(|given| !given.files.is_empty()) {
+        let dir = files.dir(&launch.id, given).display().to_string();
+        launch.env.insert(DIR_ENV.to_owned(), dir);
+    }
+    Ok(())
+}
+
+/// Variables of ConfigMaps and Secrets as the shim's standard input: in memory, and in no file.
+fn variables(launch: &Launch) -> io::Result<Stdio> {
+    let given = launch.given.iter().flat_map(|given| &given.variables);
+    let given: BTreeMap<&str, &str> = given.map(|v| (&*v.name, &*v.value)).collect();
+    if given.is_empty() {
+        return Ok(Stdio::null());
+    }
+    let mut memory = File::from(memfd_create("muster-variables", MemfdFlags::CLOEXEC)?);
+    memory.write_all(&serde_json::to_vec(&given)?)?;
+    memory.rewind()?;
+    Ok(memory.into())
 }
 
 fn unclear(what: &'static str, why: &'static str) -> SpawnError {
@@ -149,19 +185,20 @@ fn make_group(inner: &Inner, launch: &Launch) -> Result<Option<Group>, SpawnErro
     }
 }
 
-/// Executes the shim for an attempt's directory; it inherits the lock and says its word on `word`.
+/// Executes the shim for an attempt's directory; it inherits the lock, reads the variables that are not in its order from
+/// the first stream, and says its word on the second.
 pub(crate) fn spawn_shim(
     reexec: &Reexec,
     dir: &AttemptDir,
     lock: &fs::File,
-    word: OwnedFd,
+    (variables, word): (Stdio, OwnedFd),
 ) -> io::Result<Child> {
     let errors = fs::File::create(dir.path().join("shim.log"))?;
     let mut command = Command::new(&reexec.program);
     command.args(&reexec.verb);
     command.arg(dir.path()).arg("--lock-fd").arg(lock.as_raw_fd().to_string());
     // Not the agent's own standard streams: whoever reads them would wait for the last shim.
-    command.stdin(Stdio::null()).stdout(word).stderr(errors).current_dir("/");
+    command.stdin(variables).stdout(word).stderr(errors).current_dir("/");
     let lock = lock.as_fd().as_raw_fd();
     // SAFETY: only async-signal-safe system calls, on values made before the fork.
     unsafe {

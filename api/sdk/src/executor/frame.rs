@@ -3,6 +3,7 @@
 use std::io;
 
 use bytes::{Buf as _, BufMut as _, BytesMut};
+use muster_api::wire::Rope;
 use prost::Message;
 use tokio::io::{AsyncRead, AsyncReadExt as _, AsyncWrite, AsyncWriteExt as _};
 
@@ -57,8 +58,9 @@ pub(crate) async fn write<W: AsyncWrite + Unpin>(
     let prefix = u32::try_from(length).ok().filter(|_| length <= MAX_FRAME);
     let prefix =
         prefix.ok_or_else(|| io::Error::other(format!("{length} bytes are too long a frame")))?;
-    let mut frame = BytesMut::with_capacity(4 + length);
+    let mut frame = Rope::new();
     frame.put_u32(prefix);
     message.encode(&mut frame).map_err(io::Error::other)?;
-    to.write_all(&frame).await
+    frame.seal();
+    to.write_all_buf(&mut frame).await
 }

@@ -1,5 +1,6 @@
 //! Task: one run of one program on one node, the unit that is placed.
 
+pub mod config;
 pub mod probe;
 pub(super) mod rules;
 #[cfg(test)]
@@ -11,6 +12,8 @@ use k8s_openapi::apimachinery::pkg::apis::meta::v1::MicroTime;
 use kube::CustomResource;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
+
+pub use config::{EnvFrom, EnvSource, Files};
 
 use super::node::{NodeKind, Taint, TaintEffect};
 use super::{KindInfo, admit_spec};
@@ -137,6 +140,14 @@ pub struct Placement {
     pub tolerations: Vec<Toleration>,
     /// How robots are scored; the lowest score wins.
     pub cost: Cost,
+    /// The least charge of a robot's battery, percent; a node without a battery has enough. Beside it, a robot whose
+    /// battery is below its own `spec.minBattery` takes only tasks that tolerate `muster.dev/battery-low`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub min_battery: Option<u8>,
+    /// What each percent that a robot's battery lacks of a full one adds to its score, metres or seconds as `cost` has
+    /// it: of two robots the fuller one, unless it is that much farther away. None: only of equally good ones.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub battery_cost: Option<f64>,
 }
 
 /// Which kind of node a task may run on.
@@ -318,6 +329,12 @@ pub struct ContainerRun {
     /// Environment.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub env: Vec<EnvVar>,
+    /// Whole ConfigMaps and Secrets as environment.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub env_from: Vec<EnvFrom>,
+    /// ConfigMaps and Secrets as files.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub files: Vec<Files>,
     /// Working directory in the container.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub working_dir: Option<String>,
@@ -345,6 +362,12 @@ pub struct ProcessRun {
     /// Environment, beside the agent's PATH and the MUSTER_ variables.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub env: Vec<EnvVar>,
+    /// Whole ConfigMaps and Secrets as environment.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub env_from: Vec<EnvFrom>,
+    /// ConfigMaps and Secrets as files.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub files: Vec<Files>,
     /// Working directory; none: a directory of the task's own.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub working_dir: Option<String>,
@@ -362,6 +385,9 @@ pub struct EnvVar {
     /// Value.
     #[serde(default)]
     pub value: String,
+    /// Where the value comes from instead.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub value_from: Option<EnvSource>,
 }
 
 /// A directory or file of the node that a container sees.
@@ -557,6 +583,8 @@ pub struct StopOrder {
 pub const PREEMPTING: &str = "Preempting";
 /// Reason of a task that was ended to make room for one of more priority.
 pub const PREEMPTED: &str = "Preempted";
+/// Reason of a task whose node is in a maintenance window that drains it.
+pub const NODE_MAINTENANCE: &str = "NodeMaintenance";
 /// Reason of a task whose `activeDeadlineSeconds` have passed.
 pub const DEADLINE_EXCEEDED: &str = "DeadlineExceeded";
 /// Reason of a running task whose start-up probe has not succeeded yet.

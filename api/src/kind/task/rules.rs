@@ -44,6 +44,22 @@ pub(in crate::kind) fn rules(spec: &TaskSpec, violations: &mut Violations) {
 
 fn placement_rules(spec: &TaskSpec, violations: &mut Violations) {
     let placement = &spec.placement;
+    if let Some(percent) = placement.min_battery.filter(|percent| *percent > 100) {
+        violations
+            .invalid("spec.placement.minBattery", format!("{percent} is more than a full battery"))
+            .suggest("percent, 0 to 100");
+    }
+    if let Some(cost) = placement.battery_cost {
+        if !(cost >= 0.0 && cost.is_finite()) {
+            violations
+                .invalid("spec.placement.batteryCost", format!("{cost} adds nothing to a score"))
+                .suggest("metres or seconds for each percent, 0 or more; try 0.1");
+        } else if placement.at.is_none() {
+            violations
+                .invalid("spec.placement.batteryCost", "there is no score to add to")
+                .suggest("`batteryCost` needs an operation position: at: {x: 3.0, y: 4.0}");
+        }
+    }
     if let Some(within) = placement.within {
         if !(within >= 0.0 && within.is_finite()) {
             violations
@@ -172,6 +188,7 @@ fn run_rules(run: &Run, violations: &mut Violations) {
             violations.required("spec.run.container.image");
         }
         env_rules(&container.env, "spec.run.container.env", violations);
+        super::config::rules(run, "spec.run.container", violations);
         absolute("spec.run.container.workingDir", container.working_dir.as_deref(), violations);
         for (i, mount) in container.mounts.iter().enumerate() {
             let path = element_path("spec.run.container.mounts", i);
@@ -186,6 +203,7 @@ fn run_rules(run: &Run, violations: &mut Violations) {
                 .suggest("for example [\"/usr/bin/env\"]");
         }
         env_rules(&process.env, "spec.run.process.env", violations);
+        super::config::rules(run, "spec.run.process", violations);
         absolute("spec.run.process.workingDir", process.working_dir.as_deref(), violations);
     }
     if let Some(executor) = &run.executor

@@ -3,6 +3,7 @@
 
 mod any;
 mod framework;
+mod keyed;
 mod lease;
 mod node;
 mod probes;
@@ -110,6 +111,12 @@ async fn describe(
             taskset::describe(&mut sheet, &set, &tasks, now);
         }
         "Task" => task::describe(&mut sheet, &serde_json::from_value(object).map_err(read)?, now),
+        "ConfigMap" => {
+            keyed::config_map(&mut sheet, &serde_json::from_value(object).map_err(read)?, now);
+        }
+        "Secret" => {
+            keyed::secret(&mut sheet, &serde_json::from_value(object).map_err(read)?, now);
+        }
         "Lease" => lease::describe(&mut sheet, &serde_json::from_value(object).map_err(read)?, now),
         _ => any::describe(&mut sheet, &object, now),
     }
@@ -350,17 +357,21 @@ mod tests {
                 "apiVersion": "muster.dev/v1alpha1", "kind": "Quota",
                 "metadata": {"name": "default", "namespace": "default"},
                 "spec": {"hard": {"cpu": "4", "leases": 2, "extended": {"gpu": 1}}, "weight": 2},
-                "status": {"used": {"cpu": "500m", "memory": "64Mi", "leases": 1}},
+                "status": {
+                    "used": {"cpu": "500m", "memory": "64Mi", "leases": 1, "tasks": 1},
+                    "requested": {"cpu": "2", "memory": "64Mi", "leases": 1, "tasks": 2},
+                },
             }),
         );
         let (_, text) = fake.run(&["describe", "quota", "default"]).await;
         for line in [
             "Weight:          2",
-            "           USED   HARD",
-            "  cpu      0.5    4",
-            "  memory   64Mi   -",
-            "  leases   1      2",
-            "  gpu      0      1",
+            "           USED   REQUESTED   HARD",
+            "  cpu      0.5    2           4",
+            "  memory   64Mi   64Mi        -",
+            "  leases   1      1           2",
+            "  tasks    1      2           -",
+            "  gpu      0      0           1",
         ] {
             assert!(text.lines().any(|l| l == line), "{line:?} is not in\n{text}");
         }

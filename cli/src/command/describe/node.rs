@@ -1,7 +1,8 @@
 //! A node: what it has, what is reserved, who drives, where it is, what runs on it.
 
 use jiff::Timestamp;
-use muster_api::condition::{ConditionStatus, READY};
+use muster_api::condition::{BATTERY, ConditionStatus, READY};
+use muster_api::kind::node::upkeep::{MaintenanceWindow, Moment};
 use muster_api::kind::node::{Node, NodeStatus};
 use muster_api::kind::task::Task;
 use muster_api::name::FunctionName;
@@ -34,6 +35,8 @@ pub(super) fn describe(sheet: &mut Sheet, node: &Node, tasks: &[Task], now: Time
     let taints = node.spec.taints.iter();
     sheet.list("Taints", taints.map(|t| format!("{}={}:{:?}", t.key, t.value, t.effect)));
     sheet.maybe("Speed", node.spec.speed.map(|s| format!("{s} m/s")));
+    sheet.maybe("Least battery", node.spec.min_battery.map(|percent| format!("{percent} %")));
+    sheet.list("Maintenance", node.spec.maintenance.iter().map(|window| maintenance(window, now)));
     let Some(status) = &node.status else {
         sheet.field("Ready", Cell::new("no agent has joined under this name yet", Mood::Warn));
         return;
@@ -80,9 +83,35 @@ fn state(sheet: &mut Sheet, status: &NodeStatus, now: Timestamp) {
         }
         sheet.field("Pose", Cell::new(text, mood));
     }
+    if let Some(battery) = status.battery {
+        let low = status.condition(BATTERY).is_some_and(|c| c.status == ConditionStatus::False);
+        let charging = if battery.charging { ", charging" } else { "" };
+        let mood = if low { Mood::Bad } else { Mood::Plain };
+        sheet.field("Battery", Cell::new(format!("{} %{charging}", battery.percent), mood));
+    }
     let some = |text: &String| Some(text.clone()).filter(|t| !t.is_empty());
     sheet.maybe("Agent", some(&status.agent_version));
     sheet.maybe("Address", some(&status.address));
+}
+
+/// `2026-03-01T02:00:00Z for 2h every 24h: new wheels (open until …)`.
+fn maintenance(window: &MaintenanceWindow, now: Timestamp) -> String {
+    let mut text = format!("{} for {}", window.start.0, window.lasts);
+    if let Some(every) = window.every {
+        text.push_str(&format!(" every {every}"));
+    }
+    if window.drain {
+        text.push_str(", drains");
+    }
+    if !window.reason.is_empty() {
+        text.push_str(&format!(": {}", window.reason));
+    }
+    match window.at(now) {
+        Moment::Open { until } => text.push_str(&format!(" (open until {until})")),
+        Moment::Closed { next: Some(next) } => text.push_str(&format!(" (next at {next})")),
+        Moment::Closed { next: None } => text.push_str(" (over)"),
+    }
+    text
 }
 
 fn compute_table(status: &NodeStatus) -> Table {

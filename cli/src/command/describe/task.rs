@@ -2,7 +2,8 @@
 
 use jiff::Timestamp;
 use muster_api::kind::task::{
-    ContainerRun, EnvVar, Placement, ProcessRun, Resources, Task, TaskSpec, TaskStatus,
+    ContainerRun, EnvFrom, EnvVar, Files, Placement, ProcessRun, Resources, Task, TaskSpec,
+    TaskStatus,
 };
 
 use super::{begin, position, scored_by, when, which_node};
@@ -139,7 +140,8 @@ fn of_container(sheet: &mut Sheet, container: &ContainerRun) {
         format!("{} → {}{how}", m.host_path, m.mount_path)
     });
     sheet.list("Mounts", mounts);
-    environment(sheet, &container.env);
+    environment(sheet, &container.env, &container.env_from);
+    files(sheet, &container.files);
     sheet.maybe("Directory", container.working_dir.clone());
 }
 
@@ -147,12 +149,48 @@ fn of_process(sheet: &mut Sheet, process: &ProcessRun) {
     let line: Vec<String> = process.command.iter().chain(&process.args).cloned().collect();
     sheet.field("Process", command_line(&line));
     sheet.maybe("User", process.user.clone());
-    environment(sheet, &process.env);
+    environment(sheet, &process.env, &process.env_from);
+    files(sheet, &process.files);
     sheet.maybe("Directory", process.working_dir.clone());
 }
 
-fn environment(sheet: &mut Sheet, all: &[EnvVar]) {
-    sheet.list("Environment", all.iter().map(|v| format!("{}={}", v.name, v.value)));
+fn environment(sheet: &mut Sheet, all: &[EnvVar], from: &[EnvFrom]) {
+    let variable = |v: &EnvVar| {
+        let from = v.value_from.as_ref();
+        let map = from.and_then(|f| f.config_map_key_ref.as_ref()).map(|r| ("configmap", r));
+        let secret = from.and_then(|f| f.secret_key_ref.as_ref()).map(|r| ("secret", r));
+        match map.or(secret) {
+            None => format!("{}={}", v.name, v.value),
+            Some((kind, of)) => {
+                format!(
+                    "{} from {kind}/{}, key {}{}",
+                    v.name,
+                    of.name,
+                    of.key,
+                    optional(of.optional)
+                )
+            }
+        }
+    };
+    let whole = |f: &EnvFrom| {
+        let map = f.config_map_ref.as_ref().map(|r| ("configmap", r));
+        let (kind, of) = map.or_else(|| f.secret_ref.as_ref().map(|r| ("secret", r)))?;
+        Some(format!("{}* from {kind}/{}{}", f.prefix, of.name, optional(of.optional)))
+    };
+    sheet.list("Environment", from.iter().filter_map(whole).chain(all.iter().map(variable)));
+}
+
+fn files(sheet: &mut Sheet, all: &[Files]) {
+    let line = |f: &Files| {
+        let map = f.config_map.as_ref().map(|name| ("configmap", name));
+        let (kind, name) = map.or_else(|| f.secret.as_ref().map(|name| ("secret", name)))?;
+        Some(format!("{} from {kind}/{name}{}", f.mount_path, optional(f.optional)))
+    };
+    sheet.list("Files", all.iter().filter_map(line));
+}
+
+fn optional(optional: bool) -> &'static str {
+    if optional { " (optional)" } else { "" }
 }
 
 /// The words of a command; those that a shell would split are quoted, so that it is seen where each ends.

@@ -131,7 +131,12 @@ fn refuses(why: &[NodeRefusal], words: &[&str]) -> bool {
 
 /// Commands that help with the filters that refuse. `reach`: the field that says how far a robot may be.
 fn advice(why: &[NodeRefusal], reach: &str) -> Vec<String> {
-    let known: [(&[&str], String); 6] = [
+    let known: [(&[&str], String); 7] = [
+        (
+            &["ConfigMapNotFound", "ConfigMapKeyNotFound", "SecretNotFound", "SecretKeyNotFound"],
+            "`muster create configmap` or `muster create secret` makes it; the task is placed at once then"
+                .into(),
+        ),
         (
             &["LeaseHeld"],
             "`muster get leases` shows who drives; when the holder ends, the lease is free".into(),

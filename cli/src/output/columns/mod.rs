@@ -2,6 +2,7 @@
 
 pub(crate) mod event;
 pub(crate) mod framework;
+mod keyed;
 mod lease;
 mod namespace;
 mod node;
@@ -13,12 +14,14 @@ mod taskset_revision;
 use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 use muster_api::kind::KindInfo;
+use muster_api::kind::config_map::ConfigMap;
 use muster_api::kind::event::Event;
 use muster_api::kind::framework::Framework;
 use muster_api::kind::lease::Lease;
 use muster_api::kind::namespace::Namespace;
 use muster_api::kind::node::Node;
 use muster_api::kind::quota::Quota;
+use muster_api::kind::secret::Secret;
 use muster_api::kind::task::Task;
 use muster_api::kind::taskset::TaskSet;
 use muster_api::kind::taskset_revision::TaskSetRevision;
@@ -72,6 +75,8 @@ pub(crate) fn table(info: &KindInfo, objects: &[Value], layout: Layout) -> Table
         "Lease" => typed::<Lease>(lease::COLUMNS, info, objects, layout),
         "Framework" => typed::<Framework>(framework::COLUMNS, info, objects, layout),
         "Quota" => typed::<Quota>(quota::COLUMNS, info, objects, layout),
+        "ConfigMap" => typed::<ConfigMap>(keyed::CONFIG_MAP, info, objects, layout),
+        "Secret" => typed::<Secret>(keyed::SECRET, info, objects, layout),
         "Namespace" => typed::<Namespace>(namespace::COLUMNS, info, objects, layout),
         "Event" => typed::<Event>(event::COLUMNS, info, &event::by_time(objects), layout),
         _ => generic(info, objects, layout),

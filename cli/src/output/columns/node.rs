@@ -1,6 +1,9 @@
 //! Nodes: can it take tasks, what is left of it, who drives it, where it is.
 
 use muster_api::condition::ConditionStatus;
+use muster_api::kind::node::upkeep::{
+    BATTERY_LOW_TAINT, Battery, DISK_PRESSURE_TAINT, MAINTENANCE_TAINT, passing_taints,
+};
 use muster_api::kind::node::{Node, NodeStatus};
 use muster_api::name::FunctionName;
 use muster_api::resource::{Compute, format_function_list};
@@ -26,6 +29,7 @@ pub(super) const COLUMNS: &[Column<Node>] = &[
     Column::new("LEASE", |node, _| status(node, holders)),
     Column::new("POSE", |node, _| status(node, pose)),
     Column::new("AGE", |node, now| age(node.metadata.creation_timestamp.as_ref(), now)),
+    Column::wide("BATTERY", |node, _| status(node, battery)),
     Column::wide("SENSORS", |node, _| status(node, |s| functions(&s.sensors))),
     Column::wide("ACTUATORS", |node, _| status(node, |s| functions(&s.actuators))),
     Column::wide("RUNTIMES", |node, _| status(node, runtimes)),
@@ -55,10 +59,27 @@ fn ready(node: &Node) -> Cell {
         // Registered; no agent has joined under this name yet.
         None => ("NotJoined", Mood::Warn),
     };
-    match node.spec.unschedulable {
-        true => Cell::new(format!("{text},Cordoned"), Mood::Warn),
-        false => Cell::new(text, mood),
+    let cordoned = node.spec.unschedulable.then_some("Cordoned");
+    let passing = node.status.as_ref().map(passing_taints).unwrap_or_default();
+    let passing = passing.iter().map(|taint| match taint.key.as_str() {
+        BATTERY_LOW_TAINT => "BatteryLow",
+        DISK_PRESSURE_TAINT => "DiskPressure",
+        MAINTENANCE_TAINT => "Maintenance",
+        other => other,
+    });
+    let words: Vec<&str> = std::iter::once(text).chain(cordoned).chain(passing).collect();
+    match words.as_slice() {
+        [only] => Cell::new(*only, mood),
+        several => Cell::new(several.join(","), Mood::Warn),
     }
+}
+
+/// `83 %`, `12 %+` while it is being charged.
+fn battery(status: &NodeStatus) -> String {
+    let text = |battery: Battery| {
+        format!("{} %{}", battery.percent, if battery.charging { "+" } else { "" })
+    };
+    status.battery.map(text).unwrap_or_default()
 }
 
 /// `gmapping` for the holder of the only group; with several groups `arm=grasp,body=-`.
@@ -121,7 +142,8 @@ mod tests {
                 "actuators": ["base:Drive"],
                 "leases": [{"group": "body", "epoch": 3, "holder": {"namespace": "default", "name": "gmapping", "uid": "u"}}],
                 "pose": {"x": 3, "y": 4.5},
-                "conditions": [{"type": "Ready", "status": "True"}],
+                "battery": {"percent": 9, "charging": true},
+                "conditions": [{"type": "Ready", "status": "True"}, {"type": "Battery", "status": "False"}],
                 "runtimes": [{"name": "process", "available": true}, {"name": "docker", "available": false}],
                 "agentVersion": "0.1.0",
             },
@@ -141,12 +163,13 @@ mod tests {
         };
         assert_eq!(
             text(false),
-            "NAME          KIND    READY           CPU     MEMORY    LEASE              POSE        AGE\n\
-             turtlebot-1   Robot   True,Cordoned   1.5/2   3Gi/4Gi   default/gmapping   3.00,4.50   65s\n\
-             cloud-1       Cloud   NotJoined       -       -         -                  -           -\n"
+            "NAME          KIND    READY                      CPU     MEMORY    LEASE              POSE        AGE\n\
+             turtlebot-1   Robot   True,Cordoned,BatteryLow   1.5/2   3Gi/4Gi   default/gmapping   3.00,4.50   65s\n\
+             cloud-1       Cloud   NotJoined                  -       -         -                  -           -\n"
         );
         assert!(
-            text(true).contains("kinect:ImageGen,LaserGen   base:Drive   process    0.1.0"),
+            text(true)
+                .contains("9 %+      kinect:ImageGen,LaserGen   base:Drive   process    0.1.0"),
             "{}",
             text(true)
         );

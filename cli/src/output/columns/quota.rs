@@ -16,6 +16,9 @@ pub(super) const COLUMNS: &[Column<Quota>] = &[
     Column::new("LEASES", |quota, _| {
         of(quota, |used| used.leases.to_string(), |hard| hard.leases.map(|n| n.to_string()))
     }),
+    Column::new("TASKS", |quota, _| {
+        of(quota, |used| used.tasks.to_string(), |hard| hard.tasks.map(|n| n.to_string()))
+    }),
     Column::new("WEIGHT", |quota, _| quota.spec.weight.to_string().into()),
     Column::new("AGE", |quota, now| age(quota.metadata.creation_timestamp.as_ref(), now)),
     Column::wide("EXTENDED", |quota, _| extended(quota).into()),
@@ -70,11 +73,11 @@ mod tests {
 
     #[test]
     fn what_is_used_stands_before_what_is_allowed() {
-        let used = json!({"cpu": "500m", "memory": "64Mi", "leases": 1, "extended": {"gpu": 1}});
+        let used = json!({"cpu": "500m", "memory": "64Mi", "leases": 1, "tasks": 3, "extended": {"gpu": 1}});
         assert_eq!(
             text(&json!({"used": used})),
-            "NAMESPACE   NAME      CPU       MEMORY   LEASES   WEIGHT   AGE   EXTENDED\n\
-             lab         default   0.5/1.5   64Mi/-   1/2      2        -     gpu=1/1\n"
+            "NAMESPACE   NAME      CPU       MEMORY   LEASES   TASKS   WEIGHT   AGE   EXTENDED\n\
+             lab         default   0.5/1.5   64Mi/-   1/2      3/-     2        -     gpu=1/1\n"
         );
     }
 
@@ -82,8 +85,8 @@ mod tests {
     fn what_is_not_limited_or_not_counted_is_a_dash() {
         assert_eq!(
             text(&Value::Null),
-            "NAMESPACE   NAME      CPU     MEMORY   LEASES   WEIGHT   AGE   EXTENDED\n\
-             lab         default   -/1.5   -        -/2      2        -     gpu=-/1\n"
+            "NAMESPACE   NAME      CPU     MEMORY   LEASES   TASKS   WEIGHT   AGE   EXTENDED\n\
+             lab         default   -/1.5   -        -/2      -       2        -     gpu=-/1\n"
         );
     }
 }

@@ -3,7 +3,7 @@
 
 use std::collections::BTreeSet;
 
-use muster_api::kind::node::{NodeKind, TaintEffect};
+use muster_api::kind::node::{NodeKind, Taint, TaintEffect};
 use muster_api::kind::task::{Cost, NodeChoice, TaskSpec};
 use muster_api::name::FunctionName;
 use muster_api::pose::OperationPosition;
@@ -28,6 +28,7 @@ pub fn refusal(member: &Member, demand: &Demand) -> Option<Refusal> {
         .or_else(|| too_small(member, spec))
         .or_else(|| admission(facts, spec))
         .or_else(|| reach(facts, spec))
+        .or_else(|| charge(facts, spec))
         .or_else(|| what_is_left(member, facts, demand))
 }
 
@@ -77,7 +78,7 @@ pub fn unsuited(name: &str, facts: &NodeFacts, spec: &TaskSpec) -> Option<Refusa
     identity(name, facts, spec)
         .or_else(joined)
         .or_else(|| functions(facts, &resources.sensors, &resources.actuators))
-        .or_else(|| tainted(facts, spec))
+        .or_else(|| tainted(&facts.taints, spec))
 }
 
 fn abilities(facts: &NodeFacts, spec: &TaskSpec) -> Option<Refusal> {
@@ -114,17 +115,23 @@ fn too_small(member: &Member, spec: &TaskSpec) -> Option<Refusal> {
     ready.then_some(Refusal::TooSmall { shortage })
 }
 
-fn tainted(facts: &NodeFacts, spec: &TaskSpec) -> Option<Refusal> {
-    let keeps_away = |t: &&muster_api::kind::node::Taint| {
+fn tainted(taints: &[Taint], spec: &TaskSpec) -> Option<Refusal> {
+    let keeps_away = |t: &&Taint| {
         t.effect == TaintEffect::NoSchedule
             && !spec.placement.tolerations.iter().any(|o| o.tolerates(t))
     };
-    let taint = facts.taints.iter().find(keeps_away)?;
+    let taint = taints.iter().find(keeps_away)?;
     Some(Refusal::Tainted { taint: taint.clone() })
 }
 
+/// The battery that the task itself asks for.
+fn charge(facts: &NodeFacts, spec: &TaskSpec) -> Option<Refusal> {
+    let (percent, wanted) = (facts.battery?, spec.placement.min_battery?);
+    (percent < wanted).then_some(Refusal::BatteryLow { percent, wanted })
+}
+
 fn admission(facts: &NodeFacts, spec: &TaskSpec) -> Option<Refusal> {
-    if let Some(refusal) = tainted(facts, spec) {
+    if let Some(refusal) = tainted(&facts.taints, spec).or_else(|| tainted(&facts.passing, spec)) {
         return Some(refusal);
     }
     if facts.unschedulable {

@@ -5,7 +5,7 @@
 //! cluster as it goes; whoever cannot carry a bind out releases it again.
 //!
 //! Order of tasks: priority, then who waited longest. Order of nodes: a task that needs computation
-//! only tries the cloud first; robots by score where there is an operation position; else by most
+//! only tries the cloud first; robots by score where there is an operation position; else by fuller battery and most
 //! free CR. Nodes with a taint of effect PreferNoSchedule come last. A task that has no place may make room: see
 //! [`crate::preempt`].
 
@@ -266,8 +266,12 @@ fn choose(cluster: &Cluster, demand: &Demand) -> Option<Slot> {
     }
     let robot = match (&spec.placement.at, spec.placement.cost) {
         (None, _) => first_fit(cluster, demand, cluster.by_free(NodeKind::Robot), &mut second_best),
-        (Some(_), Cost::Distance) => nearest_fit(cluster, demand, &mut second_best),
-        (Some(_), Cost::TravelTime) => best_scored(cluster, demand, &mut second_best),
+        (Some(_), Cost::Distance) if spec.placement.battery_cost.is_none() => {
+            nearest_fit(cluster, demand, &mut second_best)
+        }
+        (Some(_), Cost::Distance | Cost::TravelTime) => {
+            best_scored(cluster, demand, &mut second_best)
+        }
     };
     robot.or(second_best)
 }
@@ -306,7 +310,14 @@ fn first_fit(
     None
 }
 
-/// The nearest robot that takes the task; of equally near ones that with the most free cpu.
+/// Of two equally good robots: the fuller battery, then the most free cpu; less is better.
+fn rank(cluster: &Cluster, slot: Slot) -> (u8, std::cmp::Reverse<u64>) {
+    let member = cluster.at(slot);
+    let lacks = member.facts.as_ref().map_or(100, NodeFacts::battery_lacks);
+    (lacks, std::cmp::Reverse(member.ledger.free().cpu.0))
+}
+
+/// The nearest robot that takes the task; of equally near ones the better by [`rank`].
 fn nearest_fit(cluster: &Cluster, demand: &Demand, second_best: &mut Option<Slot>) -> Option<Slot> {
     let at = demand.spec.placement.at.as_ref()?;
     let radius = demand.spec.placement.within.unwrap_or(f64::INFINITY);
@@ -322,8 +333,7 @@ fn nearest_fit(cluster: &Cluster, demand: &Demand, second_best: &mut Option<Slot
             second_best.get_or_insert(found.slot);
             continue;
         }
-        let free = |slot: Slot| cluster.at(slot).ledger.free().cpu;
-        if best.is_none_or(|(_, slot)| free(found.slot) > free(slot)) {
+        if best.is_none_or(|(_, slot)| rank(cluster, found.slot) < rank(cluster, slot)) {
             best = Some((found.distance, found.slot));
         }
     }
@@ -334,14 +344,13 @@ fn nearest_fit(cluster: &Cluster, demand: &Demand, second_best: &mut Option<Slot
 fn best_scored(cluster: &Cluster, demand: &Demand, second_best: &mut Option<Slot>) -> Option<Slot> {
     let at = demand.spec.placement.at.as_ref()?;
     let radius = demand.spec.placement.within.unwrap_or(f64::INFINITY);
-    let mut scored: Vec<(f64, std::cmp::Reverse<u64>, Slot)> = cluster
+    let mut scored: Vec<_> = cluster
         .space()
         .nearest(&at.map, at.position(), radius)
         .filter(|found| filter::refusal(cluster.at(found.slot), demand).is_none())
         .filter_map(|found| {
-            let member = cluster.at(found.slot);
-            let score = score::score(member.facts.as_ref()?, &demand.spec)?;
-            Some((score, std::cmp::Reverse(member.ledger.free().cpu.0), found.slot))
+            let score = score::score(cluster.at(found.slot).facts.as_ref()?, &demand.spec)?;
+            Some((score, rank(cluster, found.slot), found.slot))
         })
         .collect();
     scored.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
@@ -369,7 +378,10 @@ fn hardness(refusal: &Refusal) -> u8 {
         | Refusal::Apart { .. }
         | Refusal::NoExecutor { .. } => 0,
         Refusal::OutOfRange { .. } | Refusal::NoPose | Refusal::NotLocalized => 1,
-        Refusal::NotReady { .. } | Refusal::Cordoned | Refusal::Tainted { .. } => 2,
+        Refusal::NotReady { .. }
+        | Refusal::Cordoned
+        | Refusal::Tainted { .. }
+        | Refusal::BatteryLow { .. } => 2,
         Refusal::TooSmall { .. } | Refusal::NoRuntime { .. } | Refusal::NoSpeed => 3,
         Refusal::NoSensor { .. } | Refusal::NoActuator { .. } | Refusal::OtherMap { .. } => 4,
         Refusal::SelectorMismatch { .. }

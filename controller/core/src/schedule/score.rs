@@ -7,11 +7,13 @@ use muster_api::pose::OperationPosition;
 use crate::cluster::NodeFacts;
 
 /// The score of a node that passed the filters: metres for the cost `Distance` (Avalon, Alg. 1),
-/// seconds for `TravelTime` (straight line over speed). None: nothing to score by, because it is a
+/// seconds for `TravelTime` (straight line over speed), and what the task adds for each percent that the battery lacks. None: nothing to score by, because it is a
 /// cloud node or the task has no operation position.
 #[must_use]
 pub fn score(facts: &NodeFacts, spec: &TaskSpec) -> Option<f64> {
-    score_at(facts, spec.placement.at.as_ref(), spec.placement.cost)
+    let cost = score_at(facts, spec.placement.at.as_ref(), spec.placement.cost)?;
+    let lacks = f64::from(facts.battery_lacks());
+    Some(cost + spec.placement.battery_cost.unwrap_or_default() * lacks)
 }
 
 /// The same for any operation position and cost, a task's or a framework's.

@@ -26,9 +26,10 @@ use muster_api::name::NodeName;
 use muster_api::phase::TaskPhase;
 use muster_controller_core::cluster::{Cluster, Executor};
 use muster_controller_core::fairness::Accounts;
+use muster_controller_core::hold::Hold;
 use muster_controller_core::ledger::Reservation;
 use muster_controller_core::recent::Recent;
-use muster_controller_core::schedule::{self, Demand};
+use muster_controller_core::schedule::{self, Demand, Wait};
 use tokio::sync::{mpsc, oneshot};
 use tokio::time::Instant;
 
@@ -37,10 +38,11 @@ use super::desk::{self, Desk};
 use super::moves::Moves;
 use super::quotas::{Counter, Counts};
 use super::{next_events, watch_from_now};
+use crate::configs;
 use crate::context::Context;
 use crate::objects::{self, LEASES, NODES, QUOTAS, TASKS};
 use crate::session::poses::LivePoses;
-use crate::store::{Change, Event, Stored, Watcher};
+use crate::store::{Change, Event, Key, Stored, Watcher};
 
 /// How often changed numbers in a waiting task's reasons are written. New reasons are written at
 /// once; a reason whose numbers move with every bind would write without end.
@@ -120,6 +122,8 @@ impl Handle {
 struct Waiting {
     demand: Demand,
     stored: Arc<Stored>,
+    /// Why it is not considered at all; none: it is.
+    holds: Arc<[NodeRefusal]>,
     /// What its status says.
     written: Arc<[NodeRefusal]>,
     written_at: Instant,
@@ -269,6 +273,8 @@ impl Scheduler {
             self.take_in_node(change, stored);
         } else if resource == QUOTAS {
             self.take_in_quota(change, stored);
+        } else if configs::is_source(resource) {
+            self.look_at_holds(&stored.key);
         } else if resource == LEASES && change == Change::Put {
             let Some(lease) = objects::read::<Lease>(stored) else { return };
             let Ok(node) = NodeName::new(lease.spec.node.clone()) else { return };
@@ -344,13 +350,19 @@ impl Scheduler {
                     spec: self.specs.share(task.spec),
                     since,
                 };
-                self.take_in_nomination(&demand, status.nominated_node);
+                let holds = self.holds(&stored.key, &demand.spec);
+                if holds.is_empty() {
+                    self.take_in_nomination(&demand, status.nominated_node);
+                } else {
+                    self.cluster.unnominate(&uid);
+                }
                 let written_at = Instant::now();
                 self.waiting.insert(
                     uid,
                     Waiting {
                         demand,
                         stored: Arc::clone(stored),
+                        holds,
                         written: status.why.into(),
                         written_at,
                     },
@@ -385,6 +397,34 @@ impl Scheduler {
         }
     }
 
+    /// Why a task is not considered for a place, by what the store says now.
+    fn holds(&self, key: &Key, spec: &TaskSpec) -> Arc<[NodeRefusal]> {
+        let namespace = key.namespace().unwrap_or_default();
+        configs::holds(&self.context.store, namespace, spec).iter().map(Hold::refusal).collect()
+    }
+
+    /// What waiting tasks name has changed.
+    fn look_at_holds(&mut self, source: &Key) {
+        let names = |waiting: &Waiting| {
+            waiting.stored.key.namespace() == source.namespace()
+                && waiting.demand.spec.references().iter().any(|(kind, name)| {
+                    configs::key_of(*kind, source.namespace().unwrap_or_default(), name) == *source
+                })
+        };
+        let named = self.waiting.iter().filter(|(_, waiting)| names(waiting));
+        let uids: Vec<TaskUid> = named.map(|(uid, _)| uid.clone()).collect();
+        for uid in uids {
+            let Some(waiting) = self.waiting.get(&uid) else { continue };
+            let holds = self.holds(&waiting.stored.key, &waiting.demand.spec);
+            if !holds.is_empty() {
+                self.cluster.unnominate(&uid);
+            }
+            if let Some(waiting) = self.waiting.get_mut(&uid) {
+                waiting.holds = holds;
+            }
+        }
+    }
+
     /// Room that was being made before the cluster was made anew is kept on.
     fn take_in_nomination(&mut self, demand: &Demand, node: Option<String>) {
         let Some(node) = node.and_then(|n| NodeName::new(n).ok()) else { return };
@@ -410,10 +450,13 @@ impl Scheduler {
                 drop(answer.send(schedule::schedule(&mut self.cluster.clone(), &mut tasks)));
             }
             Question::Why { demand, answer } => {
+                let held = self.waiting.get(&demand.uid).map(|w| Arc::clone(&w.holds));
+                let held = held.unwrap_or_default();
                 let quota = self.quota_reason(&demand);
                 let why = schedule::explain(&self.cluster, &demand);
                 let nodes = why.iter().map(|(node, refusal)| refusal.of_node(node.as_str()));
-                drop(answer.send(quota.into_iter().chain(nodes).collect()));
+                let holds = held.iter().cloned();
+                drop(answer.send(holds.chain(quota).chain(nodes).collect()));
             }
             Question::Executors { node, executors } => {
                 self.cluster.set_executors(&node, executors);
@@ -422,13 +465,23 @@ impl Scheduler {
         }
     }
 
+    /// Who is considered for a place.
+    fn placeable(&self) -> impl Iterator<Item = &Waiting> {
+        self.waiting.values().filter(|w| w.holds.is_empty())
+    }
+
     /// Decides for everything that waits, and carries it out.
     async fn decide(&mut self) {
         self.look_again = None;
         if !self.waiting.is_empty() {
-            let mut demands: Vec<Demand> =
-                self.waiting.values().map(|w| w.demand.clone()).collect();
-            let plan = schedule::schedule(&mut self.cluster, &mut demands);
+            let mut demands: Vec<Demand> = self.placeable().map(|w| w.demand.clone()).collect();
+            let mut plan = schedule::schedule(&mut self.cluster, &mut demands);
+            plan.waits.extend(
+                self.waiting
+                    .values()
+                    .filter(|w| !w.holds.is_empty())
+                    .map(|w| Wait { uid: w.demand.uid.clone(), why: Arc::clone(&w.holds) }),
+            );
             let binds = self.bind_all(plan.binds).await;
             let preempted = self.preempt_all(plan.preemptions).await;
             let waits = self.write_reasons(plan.waits).await;
@@ -442,8 +495,7 @@ impl Scheduler {
         self.moves.take(&mut self.cluster);
         let now = Instant::now();
         let mut demands: Vec<Demand> = self
-            .waiting
-            .values()
+            .placeable()
             .filter(|w| w.demand.spec.placement.at.is_some())
             .map(|w| w.demand.clone())
             .collect();

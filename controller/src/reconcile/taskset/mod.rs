@@ -26,7 +26,7 @@ use muster_controller_core::taskset::{Snapshot, plan};
 
 use super::{again, next_events, watch_from_now};
 use crate::context::Context;
-use crate::objects::{self, REVISIONS};
+use crate::objects::{self, QUOTAS, REVISIONS};
 use crate::store::{Change, Key, StoreError, Stored};
 use index::Index;
 use write::Outcome;
@@ -63,6 +63,12 @@ async fn follow(context: &Context) -> Result<(), StoreError> {
                 let Some(events) = events else { return Ok(()) };
                 for event in &events {
                     index.take_in(event.change, &event.object);
+                    let key = &event.object.key;
+                    if key.resource == QUOTAS {
+                        // Those that wait may wait for room in it.
+                        let same = |set: &&Key| set.namespace() == key.namespace();
+                        later.keys().filter(same).for_each(|set| index.mark(set.clone()));
+                    }
                 }
             }
             () = wait => {

@@ -1,5 +1,6 @@
 //! A plan as one transaction, and what people are told when it is done.
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::{ObjectMeta, OwnerReference};
@@ -11,7 +12,8 @@ use muster_controller_core::taskset::{Action, NewTask, News, Place, Plan};
 
 use crate::context::Context;
 use crate::objects::{self, REVISIONS, TASKS};
-use crate::rest::create::{namespace_guard, prepare_object};
+use crate::quota::Pass;
+use crate::rest::create::{namespace_guard, pass, prepare_object};
 use crate::rest::delete;
 use crate::rest::failure::Failure;
 use crate::store::{Key, Op, Precondition, StoreError, Stored};
@@ -56,7 +58,7 @@ pub(super) async fn carry_out(
             precondition: Precondition::revision(stored.revision),
         },
     }];
-    let work = Work { context, stored, set };
+    let mut work = Work { context, stored, set, passes: Vec::new(), kept_out: BTreeMap::new() };
     match work.operations(plan) {
         Ok(more) => ops.extend(more),
         Err(Stop::Raced) => return Ok(Outcome::Raced),
@@ -64,8 +66,9 @@ pub(super) async fn carry_out(
     }
     match context.store.apply(ops).await {
         Ok(_) => {
-            tell(context, set, plan);
-            Ok(Outcome::Done)
+            tell(context, set, plan, &work.kept_out);
+            let refused = work.kept_out.into_values().next();
+            Ok(refused.map_or(Outcome::Done, Outcome::Refused))
         }
         Err(error) if objects::is_race(&error) => {
             tracing::debug!(set = %stored.key, %error, "a look at a task set came too late");
@@ -80,10 +83,14 @@ struct Work<'a> {
     context: &'a Context,
     stored: &'a Stored,
     set: &'a TaskSet,
+    /// Of new tasks, through their namespace's quota; kept until the commit.
+    passes: Vec<Pass>,
+    /// New tasks that the quota keeps out for now, and why.
+    kept_out: BTreeMap<String, String>,
 }
 
 impl Work<'_> {
-    fn operations(&self, plan: &Plan) -> Result<Vec<Op>, Stop> {
+    fn operations(&mut self, plan: &Plan) -> Result<Vec<Op>, Stop> {
         let mut ops = Vec::new();
         let creates = |a: &Action| matches!(a, Action::Create(_) | Action::CreateRevision { .. });
         if plan.actions.iter().any(creates) {
@@ -108,7 +115,7 @@ impl Work<'_> {
                 Action::Release { task } => {
                     ops.push(self.task(task, |t| self.disown(&mut t.metadata))?);
                 }
-                Action::Create(new) => ops.push(self.new_task(new, plan)?),
+                Action::Create(new) => ops.extend(self.new_task(new, plan)?),
                 Action::Delete { task, .. } => ops.extend(self.deletion(task)?),
             }
         }
@@ -177,10 +184,11 @@ impl Work<'_> {
         let cause = notes.and_then(|notes| notes.get(CHANGE_CAUSE));
         metadata.annotations = cause.map(|c| [(CHANGE_CAUSE.to_owned(), c.clone())].into());
         self.own(metadata);
-        self.create(self.revision_key(name), &revision)
+        self.create(self.revision_key(name), &revision).map(|(op, _)| op)
     }
 
-    fn new_task(&self, new: &NewTask, plan: &Plan) -> Result<Op, Stop> {
+    /// None: the namespace's quota has no room for it. What it has room for is made all the same.
+    fn new_task(&mut self, new: &NewTask, plan: &Plan) -> Result<Option<Op>, Stop> {
         let template = self.template(&new.revision, plan)?;
         let set = &*self.stored.key.name;
         let labels = template.labels(set, &new.revision);
@@ -202,7 +210,17 @@ impl Work<'_> {
         if self.set.spec.spread && !self.set.spec.every_node {
             placement.apart.get_or_insert_with(|| set.to_owned());
         }
-        self.create(self.task_key(&new.name), &task)
+        let (op, pass) = self.create(self.task_key(&new.name), &task)?;
+        match pass {
+            Ok(pass) => {
+                self.passes.extend(pass);
+                Ok(Some(op))
+            }
+            Err(refusal) => {
+                self.kept_out.insert(new.name.clone(), refusal.message().to_owned());
+                Ok(None)
+            }
+        }
     }
 
     /// That of the set itself, when the revision is the one that this plan keeps it as.
@@ -215,9 +233,15 @@ impl Work<'_> {
         Ok(revision.spec.template)
     }
 
-    fn create<T: serde::Serialize>(&self, key: Key, object: &T) -> Result<Op, Stop> {
+    /// A new object, and whether its namespace's quota lets it in.
+    fn create<T: serde::Serialize>(
+        &self,
+        key: Key,
+        object: &T,
+    ) -> Result<(Op, Result<Option<Pass>, Failure>), Stop> {
         let object = prepare_object(self.context, key.resource, objects::to_value(object))?;
-        Ok(Op::Put { key, value: object, precondition: Precondition::Absent })
+        let pass = pass(self.context, key.resource, &object);
+        Ok((Op::Put { key, value: object, precondition: Precondition::Absent }, pass))
     }
 
     /// The end of a task; it passes only while its node is not locked.
@@ -240,9 +264,13 @@ impl Work<'_> {
 }
 
 /// Puts into Events what a plan did.
-fn tell(context: &Context, set: &TaskSet, plan: &Plan) {
+fn tell(context: &Context, set: &TaskSet, plan: &Plan, kept_out: &BTreeMap<String, String>) {
+    for why in kept_out.values() {
+        context.events.warn_set(set, "FailedCreate", why.clone());
+    }
     for action in &plan.actions {
         match action {
+            Action::Create(new) if kept_out.contains_key(&new.name) => {}
             Action::Create(new) => {
                 context.events.set(
                     set,

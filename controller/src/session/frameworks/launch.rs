@@ -5,14 +5,18 @@ use muster_api::kind::framework::{ACKNOWLEDGE_FINALIZER, FRAMEWORK_LABEL};
 use muster_api::kind::task::Task;
 use muster_api::wire::framework::v1 as wire;
 use muster_api::wire::framework_session::json_of;
+use muster_controller_core::hold::Hold;
 use muster_controller_core::offer::OfferId;
 use serde_json::{Value, json};
 
 use super::{convert, subscribe};
+use crate::configs;
 use crate::context::Context;
 use crate::objects::TASKS;
+use crate::quota::Pass;
 use crate::reconcile::desk::{FrameworkUid, Prepared};
 use crate::rest::create;
+use crate::rest::failure::Failure;
 use crate::store::{Key, Op};
 
 /// Checks everything that can be checked without the ledger; all that is wrong is said at once.
@@ -45,7 +49,7 @@ pub(super) fn prepare(
             continue;
         };
         match task_of(context, (framework, uid), launch) {
-            Ok((object, task)) => prepared.push(Prepared {
+            Ok((object, task, pass)) => prepared.push(Prepared {
                 key: Key::namespaced(
                     TASKS,
                     namespace,
@@ -55,6 +59,7 @@ pub(super) fn prepare(
                 object,
                 spec: task.spec,
                 offer,
+                _pass: pass,
             }),
             Err(wrong) => causes.extend(wrong.into_iter().map(|cause| wire::Cause {
                 field: format!("launches[{i}].{}", cause.field),
@@ -74,7 +79,7 @@ fn task_of(
     context: &Context,
     (framework, uid): (&Key, &FrameworkUid),
     launch: &wire::Launch,
-) -> Result<(Value, Task), Vec<wire::Cause>> {
+) -> Result<(Value, Task, Option<Pass>), Vec<wire::Cause>> {
     let spec = launch.spec.as_ref().map(json_of).unwrap_or_default();
     let mut labels: serde_json::Map<String, Value> =
         launch.labels.iter().map(|(k, v)| (k.clone(), v.as_str().into())).collect();
@@ -96,7 +101,7 @@ fn task_of(
     });
     let wrong =
         |field: &str, message: String| vec![wire::Cause { field: field.to_owned(), message }];
-    let object = create::prepare_object(context, TASKS, object).map_err(|failure| {
+    let refused = |failure: Failure| {
         let causes = failure.causes();
         if causes.is_empty() {
             return wrong("spec", failure.message().to_owned());
@@ -108,14 +113,25 @@ fn task_of(
                 message,
             })
             .collect()
-    })?;
+    };
+    let object = create::prepare_object(context, TASKS, object).map_err(refused)?;
     let task: Task =
         serde_json::from_value(object.clone()).map_err(|error| wrong("spec", error.to_string()))?;
+    let holds =
+        configs::holds(&context.store, framework.namespace().unwrap_or_default(), &task.spec);
+    if !holds.is_empty() {
+        let cause = |hold: &Hold| wire::Cause {
+            field: "spec.run".to_owned(),
+            message: format!("{}: {hold}", hold.reason()),
+        };
+        return Err(holds.iter().map(cause).collect());
+    }
     if task.spec.placement.node.is_some() {
         return Err(wrong(
             "spec.placement.node",
             "is set by the offer that the launch uses; leave it out".to_owned(),
         ));
     }
-    Ok((object, task))
+    let pass = create::pass(context, TASKS, &object).map_err(refused)?;
+    Ok((object, task, pass))
 }

@@ -1,5 +1,7 @@
 //! Node: a robot or a cloud server that runs an agent.
 
+pub mod upkeep;
+
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::MicroTime;
 use kube::CustomResource;
 use schemars::JsonSchema;
@@ -13,6 +15,7 @@ use crate::name::FunctionName;
 use crate::pose::Pose;
 use crate::resource::Compute;
 use crate::validate::{Violations, element_path};
+use upkeep::{Battery, MaintenanceWindow};
 
 /// What a node is.
 #[derive(
@@ -49,6 +52,28 @@ pub struct NodeSpec {
     /// Usual speed of a robot, metres per second; the cost `TravelTime` needs it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub speed: Option<f64>,
+    /// Below how much charge nothing new begins on the robot, percent; tasks that tolerate `muster.dev/battery-low` (a
+    /// drive to the charger) do. None: 10.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub min_battery: Option<u8>,
+    /// When people work on it.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub maintenance: Vec<MaintenanceWindow>,
+}
+
+impl NodeSpec {
+    /// A node of this kind of which nothing else is said.
+    #[must_use]
+    pub fn new(kind: NodeKind) -> Self {
+        NodeSpec {
+            kind,
+            unschedulable: false,
+            taints: Vec::new(),
+            speed: None,
+            min_battery: None,
+            maintenance: Vec::new(),
+        }
+    }
 }
 
 /// Annotation of a Node that is in the middle of a mission, `HOLDER: REASON`: no TaskSet ends a task there.
@@ -120,7 +145,11 @@ pub struct NodeStatus {
     /// A coarse checkpoint of where the robot is.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub pose: Option<Pose>,
-    /// Facts about the node; `Ready` and `Fenced` are the controller's, the others are the agent's.
+    /// The charge of its battery; none: it has none, or does not tell.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub battery: Option<Battery>,
+    /// Facts about the node; `Ready`, `Fenced`, `Battery` and `Maintenance` are the controller's, the others are the
+    /// agent's.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub conditions: Vec<Condition>,
     /// How tasks can be run there.
@@ -206,6 +235,7 @@ fn rules(spec: &NodeSpec, violations: &mut Violations) {
     if spec.kind == NodeKind::Cloud && spec.speed.is_some() {
         violations.forbidden("spec.speed", "a Cloud node does not move").suggest("leave it out");
     }
+    upkeep::rules(spec, violations);
 }
 
 fn kind_stays(old: &serde_json::Value, new: &serde_json::Value, violations: &mut Violations) {
@@ -236,6 +266,24 @@ mod tests {
     use serde_json::json;
 
     use crate::kind::{admit, admit_change, find};
+
+    #[test]
+    fn windows_and_batteries_make_sense() {
+        let window = json!({"start": "2026-03-01T02:00:00.000000Z", "lasts": "2h", "every": "1h"});
+        let spec = json!({"kind": "Cloud", "minBattery": 101, "maintenance": [window]});
+        let node = json!({"apiVersion": crate::API_VERSION, "kind": "Node", "metadata": {"name": "n"}, "spec": spec});
+        let said: Vec<String> =
+            admit(&node).expect_err("no").iter().map(ToString::to_string).collect();
+        assert_eq!(
+            said,
+            [
+                "spec.minBattery: 101 is more than a full battery; percent, 0 to 100",
+                "spec.minBattery: a Cloud node has no battery; leave it out",
+                "spec.maintenance[0].every: 1h is not longer than the window itself, 2h; \
+                 from one beginning to the next; 24h for every day",
+            ]
+        );
+    }
 
     #[test]
     fn a_node_keeps_its_kind() {

@@ -1,6 +1,8 @@
 //! `muster plan`: what applying manifests would do, decided by the real scheduler on a copy of what
 //! it knows. Exit code 0: nothing; 1: there are changes; 255: no plan could be made.
 
+mod index;
+
 use std::path::PathBuf;
 
 use muster_api::id::Epoch;
@@ -12,8 +14,8 @@ use serde_json::{Value, json};
 use super::Outcome;
 use super::apply::{self, Action, Step};
 use super::why::refusal_table;
-use crate::client::group_path;
-use crate::error::CliError;
+use crate::client::{Client, group_path};
+use crate::error::{Class, CliError, Refusal};
 use crate::exit;
 use crate::manifests::{self, Manifest};
 use crate::merge::FieldChange;
@@ -47,6 +49,9 @@ struct Plan {
     preemptions: Vec<Preemption>,
     #[serde(default)]
     revision: String,
+    /// See [`index`].
+    #[serde(default)]
+    index: String,
 }
 
 #[derive(Debug, Deserialize)]
@@ -112,18 +117,10 @@ struct Wait {
 
 pub(crate) async fn run(args: Args, session: &mut Session) -> Outcome {
     let manifests = manifests::load(&args.filename, &session.namespace, session.namespace_given)?;
-    let objects: Vec<Value> = manifests.iter().map(|m| m.admitted.clone()).collect();
+    let objects = objects(&manifests);
     let steps = apply::look_at_all(&session.client, manifests).await?;
     apply::rehearse(&session.client, &steps).await?;
-    let uri = group_path("plan");
-    let mut answer: Value = session.client.post_json(&uri, &json!({"objects": objects})).await?;
-    // The controller plans placements; which fields apply would change, only apply's own rules say.
-    answer["changes"] = steps.iter().map(change).collect();
-    let plan: Plan = serde_json::from_value(answer.clone()).map_err(|source| CliError::Answer {
-        server: session.client.server.clone(),
-        request: format!("POST {uri}"),
-        source,
-    })?;
+    let (answer, plan) = ask(&session.client, objects, &steps).await?;
     match args.output {
         Some(format @ (Format::Yaml | Format::Json)) => {
             session.ui.print(&document(&answer, format)?)?;
@@ -135,6 +132,49 @@ pub(crate) async fn run(args: Args, session: &mut Session) -> Outcome {
     }
     let changes = plan.changes.iter().any(|c| c.action != What::Unchanged);
     Ok(if changes { exit::FAILURE } else { exit::OK })
+}
+
+/// What the scheduler is asked about.
+fn objects(manifests: &[Manifest]) -> Vec<Value> {
+    manifests.iter().map(|m| m.admitted.clone()).collect()
+}
+
+/// The controller's answer with what apply would change, and the same to be looked at.
+async fn ask(
+    client: &Client,
+    objects: Vec<Value>,
+    steps: &[Step],
+) -> Result<(Value, Plan), CliError> {
+    let uri = group_path("plan");
+    let mut answer: Value = client.post_json(&uri, &json!({ "objects": objects })).await?;
+    // The controller plans placements; which fields apply would change, only apply's own rules say.
+    answer["changes"] = steps.iter().map(change).collect();
+    answer["index"] = index::of(&answer).into();
+    let plan = serde_json::from_value(answer.clone()).map_err(|source| CliError::Answer {
+        server: client.server.clone(),
+        request: format!("POST {uri}"),
+        source,
+    })?;
+    Ok((answer, plan))
+}
+
+/// Whether applying would do what a plan with this index said; if not, what it would do now.
+pub(super) async fn check(session: &Session, steps: &[Step], index: &str) -> Result<(), CliError> {
+    let objects = steps.iter().map(|step| step.manifest.admitted.clone()).collect();
+    let (_, plan) = ask(&session.client, objects, steps).await?;
+    if plan.index == index {
+        return Ok(());
+    }
+    let now = render(&plan, &Styles::default());
+    Err(CliError::Refused(Box::new(Refusal {
+        class: Class::Conflict,
+        reason: "PlanOutdated".to_owned(),
+        message: format!(
+            "the cluster or the manifests have changed since the plan {index}; nothing was stored. Now:\n{now}"
+        ),
+        causes: Vec::new(),
+        hint: Some(format!("`muster apply --check-index {}` applies this", plan.index)),
+    })))
 }
 
 fn change(step: &Step) -> Value {
@@ -230,7 +270,10 @@ fn summary(plan: &Plan) -> String {
     if !plan.revision.is_empty() {
         text.push_str(&format!(" As of revision {}.", plan.revision));
     }
-    text.push('\n');
+    text.push_str(&format!(
+        "\nIndex: {}; `muster apply --check-index` with it does this or nothing.\n",
+        plan.index
+    ));
     text
 }
 
@@ -254,6 +297,35 @@ mod tests {
         path.display().to_string()
     }
 
+    /// The text with a word for the index, and the index.
+    fn without_index(text: &str) -> (String, String) {
+        let index = text.split_once("Index: ").and_then(|(_, rest)| rest.split_once(';'));
+        let index = index.expect("a plan has an index").0.to_owned();
+        (text.replace(&index, "INDEX"), index)
+    }
+
+    #[tokio::test]
+    async fn a_plan_is_applied_as_it_was_or_not_at_all() {
+        let dir = tempfile::tempdir().expect("a directory");
+        let path = manifest(&dir);
+        let fake = Fake::new();
+        let plan = |node: &str| {
+            let place = |name: &str| json!({"namespace": "default", "name": name, "node": node, "leases": []});
+            json!({"placements": [place("a"), place("b")], "revision": "7"})
+        };
+        fake.answer(PLAN, plan("r1"));
+        let (_, index) = without_index(&fake.run(&["plan", "-f", &path]).await.1);
+        fake.answer(PLAN, plan("r2"));
+        let refused = fake.try_run(&["apply", "-f", &path, "--check-index", &index]).await;
+        let text = refused.expect_err("it would be something else").to_string();
+        assert!(text.contains("+ task/a in default → r2") && text.contains(&index), "{text}");
+        assert_eq!(fake.object("tasks/default/a"), None, "nothing was stored");
+        fake.answer(PLAN, plan("r1"));
+        let (code, text) = fake.run(&["apply", "-f", &path, "--check-index", &index]).await;
+        assert_eq!(code, exit::OK, "{text}");
+        assert!(fake.object("tasks/default/a").is_some());
+    }
+
     #[tokio::test]
     async fn the_exit_code_says_whether_there_are_changes() {
         let dir = tempfile::tempdir().expect("a directory");
@@ -268,11 +340,13 @@ mod tests {
         }));
         let (code, text) = fake.run(&["plan", "-f", &path]).await;
         assert_eq!(code, exit::FAILURE);
+        let (text, index) = without_index(&text);
         assert_eq!(
             text,
             "+ task/a in default → r1, score 2.35, lease r1.body epoch 4\n\
              + task/b in default\n    would wait:\n    NODE   REFUSED BY   WHY\n    r1     LeaseHeld    held\n\
-             \nPlan: 2 to create, 0 to change, 0 unchanged. 1 of 2 new tasks would be placed at once. As of revision 7.\n"
+             \nPlan: 2 to create, 0 to change, 0 unchanged. 1 of 2 new tasks would be placed at once. As of revision 7.\n\
+             Index: INDEX; `muster apply --check-index` with it does this or nothing.\n"
         );
         assert_eq!(fake.object("tasks/default/a"), None, "a plan stores nothing");
         fake.answer(PLAN, json!({"revision": "8"}));
@@ -282,10 +356,13 @@ mod tests {
         fake.edit("tasks/default/a", |o| o["spec"]["priority"] = json!(9));
         let (code, text) = fake.run(&["plan", "-f", &path]).await;
         assert_eq!(code, exit::FAILURE);
+        let (text, other) = without_index(&text);
+        assert_ne!(other, index);
         assert_eq!(
             text,
             "~ task/a in default\n    spec.priority: 9 → 2\n\n\
-             Plan: 0 to create, 1 to change, 1 unchanged. As of revision 8.\n"
+             Plan: 0 to create, 1 to change, 1 unchanged. As of revision 8.\n\
+             Index: INDEX; `muster apply --check-index` with it does this or nothing.\n"
         );
     }
 

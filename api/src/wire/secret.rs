@@ -1,0 +1,37 @@
+//! How messages with values of ConfigMaps and Secrets are shown in logs: by name and size.
+
+use std::fmt;
+
+use super::agent::v1::{File, Variable};
+
+impl fmt::Debug for Variable {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Variable").field("name", &self.name).finish_non_exhaustive()
+    }
+}
+
+impl fmt::Debug for File {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("File")
+            .field("directory", &self.directory)
+            .field("path", &self.path)
+            .field("bytes", &self.data.len())
+            .field("mode", &self.mode)
+            .field("secret", &self.secret)
+            .finish_non_exhaustive()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn values_are_not_shown() {
+        let variable = Variable { name: "TOKEN".to_owned(), value: "hunter2".to_owned() };
+        let file = File { data: "hunter2".into(), path: "key".to_owned(), ..File::default() };
+        let shown = format!("{variable:?} {file:?}");
+        assert!(shown.contains("TOKEN") && shown.contains("key"), "{shown}");
+        assert!(!shown.contains("hunter2"), "{shown}");
+    }
+}

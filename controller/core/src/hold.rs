@@ -1,0 +1,103 @@
+//! Why a task is not considered for a place at all, whatever the nodes are like: something that it is to find when it
+//! starts is not there.
+//!
+//! A hold is said of the whole cluster: [`Hold::refusal`] names no node. The scheduler passes over a task that is held
+//! and writes its holds as its reasons; a framework's launch is refused with them.
+
+use std::fmt;
+
+use muster_api::kind::task::NodeRefusal;
+use muster_api::kind::task::config::Source;
+
+/// One reason.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Hold {
+    /// The task names a ConfigMap or a Secret that is not there.
+    ObjectNotFound {
+        /// Which kind.
+        source: Source,
+        /// Its name, in the task's namespace.
+        name: String,
+    },
+    /// It is there and has not the key.
+    KeyNotFound {
+        /// Which kind.
+        source: Source,
+        /// Its name.
+        name: String,
+        /// The key.
+        key: String,
+    },
+    /// A variable must be text without a zero byte, and the value is not.
+    NotText {
+        /// Which kind.
+        source: Source,
+        /// Its name.
+        name: String,
+        /// The key.
+        key: String,
+    },
+    /// All that the task wants together is more than one message to its node takes.
+    TooLarge {
+        /// Bytes.
+        bytes: usize,
+        /// Most allowed.
+        most: usize,
+    },
+}
+
+impl Hold {
+    /// The reason as one word, for programs.
+    #[must_use]
+    pub fn reason(&self) -> &'static str {
+        use Source::{ConfigMap, Secret};
+        match self {
+            Hold::ObjectNotFound { source: ConfigMap, .. } => "ConfigMapNotFound",
+            Hold::ObjectNotFound { source: Secret, .. } => "SecretNotFound",
+            Hold::KeyNotFound { source: ConfigMap, .. } => "ConfigMapKeyNotFound",
+            Hold::KeyNotFound { source: Secret, .. } => "SecretKeyNotFound",
+            Hold::NotText { source: ConfigMap, .. } => "ConfigMapValueNotText",
+            Hold::NotText { source: Secret, .. } => "SecretValueNotText",
+            Hold::TooLarge { .. } => "ConfigTooLarge",
+        }
+    }
+
+    /// The hold as a task's status carries it.
+    #[must_use]
+    pub fn refusal(&self) -> NodeRefusal {
+        NodeRefusal {
+            node: String::new(),
+            reason: self.reason().to_owned(),
+            message: self.to_string(),
+        }
+    }
+}
+
+fn kind(source: Source) -> &'static str {
+    match source {
+        Source::ConfigMap => "ConfigMap",
+        Source::Secret => "Secret",
+    }
+}
+
+impl fmt::Display for Hold {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Hold::ObjectNotFound { source, name } => {
+                write!(f, "there is no {} {name}; waits until it is created", kind(*source))
+            }
+            Hold::KeyNotFound { source, name, key } => {
+                write!(f, "the {} {name} has no key {key:?}; waits until it has", kind(*source))
+            }
+            Hold::NotText { source, name, key } => write!(
+                f,
+                "the value of {key:?} in the {} {name} is not text, and a variable must be; use it as a file",
+                kind(*source)
+            ),
+            Hold::TooLarge { bytes, most } => write!(
+                f,
+                "its ConfigMaps and Secrets come to {bytes} bytes, at most {most} are sent to a node"
+            ),
+        }
+    }
+}
