@@ -51,12 +51,7 @@ impl Board {
         self.entries.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    pub(crate) fn publish(
-        &self,
-        workload: &Workload,
-        runtime: &Arc<dyn Runtime>,
-        reserved: u64,
-    ) {
+    pub(crate) fn publish(&self, workload: &Workload, runtime: &Arc<dyn Runtime>, reserved: u64) {
         let Workload { uid, report, attempt, .. } = workload;
         let (attempt, known) = (*attempt, !matches!(workload.state, State::Recovering { .. }));
         let mut entries = self.entries();

@@ -3,11 +3,14 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use muster_agent_core::desired::StopOrder;
+use muster_agent_core::depend::Dependency;
+use muster_agent_core::desired::{Desired, StopOrder};
 use muster_agent_core::plan::{self, Assignments, Skipped, Step};
 use muster_agent_core::workload::Event;
 use muster_api::id::TaskUid;
+use muster_api::wire::WireError;
 use muster_api::wire::agent::v1 as proto;
+use muster_api::wire::agent_session::dependency_condition_from_wire;
 use tokio::sync::mpsc;
 use tokio::task::JoinSet;
 

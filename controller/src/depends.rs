@@ -2,6 +2,7 @@
 
 use std::collections::BTreeSet;
 
+use muster_api::kind::namespace::DEFAULT;
 use muster_api::kind::task::depend::{self, Graph};
 use muster_api::kind::task::{Task, TaskSpec, TaskStatus};
 use muster_api::validate::{Violations, element_path};
@@ -21,13 +22,13 @@ fn task(store: &Store, namespace: &str, name: &str) -> Option<Task> {
 }
 
 /// The keys of the tasks that a task of `namespace` waits for.
-pub fn keys<'a>(namespace: &'a str, spec: &'a TaskSpec) -> impl Iterator<Item = Key> + 'a {
+pub(crate) fn keys<'a>(namespace: &'a str, spec: &'a TaskSpec) -> impl Iterator<Item = Key> + 'a {
     spec.depends_on.iter().map(move |one| key_of(namespace, &one.task))
 }
 
 /// What holds a task of `namespace`.
 #[must_use]
-pub fn holds(store: &Store, namespace: &str, spec: &TaskSpec) -> Vec<Hold> {
+pub(crate) fn holds(store: &Store, namespace: &str, spec: &TaskSpec) -> Vec<Hold> {
     let hold = |one: &depend::DependsOn| {
         let name = one.task.clone();
         let Some(task) = task(store, namespace, &name) else {
@@ -40,9 +41,28 @@ pub fn holds(store: &Store, namespace: &str, spec: &TaskSpec) -> Vec<Hold> {
     spec.depends_on.iter().filter_map(hold).collect()
 }
 
+/// The same when `objects`, manifests that were admitted, are stored as well: a task among them is there, and has not
+/// begun.
+#[must_use]
+pub(crate) fn holds_with(store: &Store, objects: &[Value], namespace: &str, spec: &TaskSpec) -> Vec<Hold> {
+    let planned = |name: &str| {
+        objects.iter().any(|object| {
+            let there = object["metadata"]["namespace"].as_str().unwrap_or(DEFAULT);
+            object["kind"] == "Task" && object["metadata"]["name"] == name && there == namespace
+        })
+    };
+    let hold = |hold: Hold| match hold {
+        Hold::DependencyNotFound { task } if planned(&task) => {
+            Hold::DependencyNotMet { task, why: "is created with it".to_owned() }
+        }
+        other => other,
+    };
+    holds(store, namespace, spec).into_iter().map(hold).collect()
+}
+
 /// What the agent of a placed task is told of those that it waits for.
 #[must_use]
-pub fn to_wire(store: &Store, namespace: &str, spec: &TaskSpec) -> Vec<wire::Dependency> {
+pub(crate) fn to_wire(store: &Store, namespace: &str, spec: &TaskSpec) -> Vec<wire::Dependency> {
     let dependency = |one: &depend::DependsOn| {
         let task = task(store, namespace, &one.task);
         let mut told = wire::Dependency {

@@ -4,6 +4,7 @@
 use std::fmt;
 
 use muster_api::kind::task::{LIVENESS_FAILED, NOT_READY, STARTING_UP, STARTUP_FAILED};
+use muster_api::phase::TaskPhase;
 use serde::{Deserialize, Serialize};
 
 use crate::observed::{End, Exit, Loss, Said};

@@ -76,6 +76,18 @@ impl Hold {
         }
     }
 
+    /// The field of the task that it is about.
+    #[must_use]
+    pub fn field(&self) -> &'static str {
+        match self {
+            Hold::DependencyNotFound { .. } | Hold::DependencyNotMet { .. } => "spec.dependsOn",
+            Hold::ObjectNotFound { .. }
+            | Hold::KeyNotFound { .. }
+            | Hold::NotText { .. }
+            | Hold::TooLarge { .. } => "spec.run",
+        }
+    }
+
     /// The hold as a task's status carries it.
     #[must_use]
     pub fn refusal(&self) -> NodeRefusal {

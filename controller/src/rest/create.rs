@@ -13,6 +13,7 @@ use super::query::FieldValidation;
 use super::registry::Entry;
 use super::{Answer, Call, admission, body, failure::Failure, metadata, namespace};
 use crate::context::Context;
+use crate::depends;
 use crate::objects::TASKS;
 use crate::quota::{self, Pass};
 use crate::store::{Op, Precondition, Resource, StoreError, Stored};
@@ -190,6 +191,10 @@ fn prepare(
     }
     let name = metadata::text(&object, "name").unwrap_or_default().to_owned();
     let mut admitted = admission::admit(new.entry, &name, object, new.mode)?;
+    if new.entry.resource == TASKS {
+        depends::check(&context.store, &admitted.object)
+            .map_err(|violations| Failure::invalid(new.entry, &name, &violations))?;
+    }
     if info.kind == "Namespace" {
         namespace::complete(&mut admitted.object);
     }

@@ -15,9 +15,8 @@ use serde_json::{Value, json};
 use super::failure::Failure;
 use super::path::Object;
 use super::{Answer, Call, body, registry};
-use crate::configs;
 use crate::context::{Context, Live};
-use crate::objects;
+use crate::{configs, depends, objects};
 
 pub(super) fn live(context: &Context) -> Result<&Live, Failure> {
     context.live().ok_or_else(|| Failure::unavailable("the scheduler is not running"))
@@ -129,7 +128,8 @@ fn hold_back(
     let (mut held, mut free) = (Vec::new(), Vec::new());
     for demand in demands {
         let (namespace, _) = demand.title.split_once('/').unwrap_or_default();
-        let holds = configs::holds_with(&context.store, objects, namespace, &demand.spec);
+        let mut holds = depends::holds_with(&context.store, objects, namespace, &demand.spec);
+        holds.extend(configs::holds_with(&context.store, objects, namespace, &demand.spec));
         if holds.is_empty() {
             free.push(demand);
         } else {

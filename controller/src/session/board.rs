@@ -17,11 +17,11 @@ use prost::Message as _;
 use tokio::sync::Notify;
 
 use super::{Sessions, lock};
-use crate::configs;
 use crate::context::Context;
 use crate::objects::{self, TASKS};
 use crate::reconcile::{next_events, watch_from_now};
 use crate::store::{Change, Key, Store, Stored};
+use crate::{configs, depends};
 
 /// Most bytes of assignments in one message; a single one may be larger, and is still less than a message takes.
 const PART: usize = 1 << 20;
@@ -40,7 +40,7 @@ struct Pages {
     by_node: HashMap<NodeName, Page>,
     /// Every placed task: where it is and what its object is called.
     tasks: HashMap<TaskUid, (NodeName, Key)>,
-    /// Which placed tasks name a ConfigMap or a Secret, by the object's key.
+    /// Which placed tasks name a ConfigMap, a Secret or another task, by the object's key.
     users: HashMap<Key, BTreeSet<TaskUid>>,
     /// The store was looked at since the start; before that, "not here" means nothing.
     filled: bool,
@@ -115,7 +115,7 @@ impl Board {
         something.then_some(wire::Assignments { upserts, released, ..Default::default() })
     }
 
-    /// A ConfigMap or a Secret changed: what placed tasks get of it is looked up again. Their attempts keep what they
+    /// A ConfigMap, a Secret or a task changed: what placed tasks get of it is looked up again. Their attempts keep what they
     /// have; the agents keep the new values for the next ones.
     fn source_changed(&self, store: &Store, source: &Key) {
         let users = lock(&self.pages).users.get(source).cloned().unwrap_or_default();
@@ -195,6 +195,8 @@ fn assignment(store: &Store, task: &Task) -> wire::Assignment {
     let namespace = task.metadata.namespace.clone().unwrap_or_default();
     let ended = status.phase.is_terminal();
     // What has ended needs nothing any more.
+    let dependencies =
+        if ended { Vec::new() } else { depends::to_wire(store, &namespace, &task.spec) };
     let config = (!ended).then(|| configs::to_wire(store, &namespace, &task.spec)).flatten();
     let deleted = task.metadata.deletion_timestamp.is_some().then(|| "Deleted".to_owned());
     let ordered = || status.stop.as_ref().map(|stop| format!("{}: {}", stop.reason, stop.message));
@@ -210,11 +212,7 @@ fn assignment(store: &Store, task: &Task) -> wire::Assignment {
         stop,
         ended,
         config,
-        dependencies: if ended {
-            Vec::new()
-        } else {
-            depends::to_wire(store, &namespace_of(task), &task.spec)
-        },
+        dependencies,
         framework: super::frameworks::owning(&task.metadata)
             .map(|o| wire::Framework { id: o.uid.clone(), name: o.name.clone() }),
     }

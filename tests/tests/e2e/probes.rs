@@ -261,3 +261,31 @@ async fn a_rollout_waits_for_ready_and_goes_back_when_a_probe_fails() {
     let same = before.iter().filter(|process| after.contains(process)).count();
     assert_eq!(same, 2, "only the canary was touched: {before:?} {after:?}");
 }
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_check_sees_what_its_task_is_given() {
+    let mut cluster = one_robot().await;
+    let secret = json!({
+        "apiVersion": "v1", "kind": "Secret", "metadata": {"name": "camera"},
+        "stringData": {"password": "change-me"},
+    });
+    cluster.post("/api/v1/namespaces/default/secrets", &secret).await;
+    let test = "[ \"$CAMERA_password\" = change-me ] && grep -q change-me keys/password";
+    let spec = json!({
+        "run": {"process": {
+            "command": ["sleep", "1000"],
+            "envFrom": [{"prefix": "CAMERA_", "secretRef": {"name": "camera"}}],
+            "files": [{"secret": "camera", "mountPath": "keys"}],
+        }},
+        "gracePeriodSeconds": 0,
+        "readiness": {"exec": {"command": ["sh", "-c", test]}, "period": "200ms", "timeout": "20s"},
+    });
+    cluster.create("given", spec).await;
+    cluster.task("given", "ready", TaskStatus::is_ready).await;
+    let log = cluster.log_of("robot");
+    cluster.kill_agent("robot");
+    cluster.restart_agent("robot").await;
+    cluster.task("given", "ready again", TaskStatus::is_ready).await;
+    assert!(!log.contains("change-me"), "{log}");
+    cluster.delete("given").await;
+}

@@ -107,10 +107,14 @@ mod tests {
     fn nothing_begins_before_the_others_have_come_so_far() {
         let (mut task, effects) = assigned(RestartPolicy::Never);
         assert!(!effects.contains(&Effect::Launch(1)), "{effects:?}");
-        let effects = told(&mut task, standing(Some("waits for task camera, which is Starting"), 0));
+        let effects =
+            told(&mut task, standing(Some("waits for task camera, which is Starting"), 0));
         assert!(!effects.contains(&Effect::Launch(1)), "{effects:?}");
         let content = &task.report.content;
-        assert_eq!((content.phase, &content.reason), (Phase::Starting, &Reason::AwaitingDependency));
+        assert_eq!(
+            (content.phase, &content.reason),
+            (Phase::Starting, &Reason::AwaitingDependency)
+        );
         assert_eq!(content.message, "waits for task camera, which is Starting");
         assert!(told(&mut task, standing(None, 1)).contains(&Effect::Launch(1)));
         let _ = launched(&mut task);
@@ -148,7 +152,9 @@ mod tests {
         let _ = task.restored(true, context());
         let found = Outcome::Found(Observed::Running(Started { at: Wall(1) }));
         let _ = task.handle(Event::Attempt(1, found), context());
-        assert!(!told(&mut task, standing(None, 1)).iter().any(|e| matches!(e, Effect::Stop { .. })));
+        assert!(
+            !told(&mut task, standing(None, 1)).iter().any(|e| matches!(e, Effect::Stop { .. }))
+        );
         // A reboot: what was known before it does not count.
         let _ = task.restored(false, context());
         let effects = exited(&mut task, End::Lost(Loss::Reboot));

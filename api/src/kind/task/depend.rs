@@ -62,7 +62,9 @@ pub(super) fn rules(spec: &TaskSpec, violations: &mut Violations) {
         violations.invalid("spec.dependsOn", format!("{} tasks; at most {MAX}", all.len()));
     }
     if spec.run.executor.is_some() && all.iter().any(|one| one.restart) {
-        violations.invalid("spec.dependsOn", "an executor's work is not run again by itself").suggest("leave `restart` out");
+        violations
+            .invalid("spec.dependsOn", "an executor's work is not run again by itself")
+            .suggest("leave `restart` out");
     }
     let mut seen = BTreeSet::new();
     for (i, one) in all.iter().enumerate() {
@@ -145,11 +147,14 @@ mod tests {
     #[test]
     fn how_far_a_task_has_come() {
         use DependencyCondition::{Ready, Running, Succeeded};
-        let met = |condition: DependencyCondition, phase, ready| condition.unmet(phase, ready).is_none();
+        let met =
+            |condition: DependencyCondition, phase, ready| condition.unmet(phase, ready).is_none();
         for ready in [None, Some(true), Some(false)] {
             assert!(met(Running, TaskPhase::Running, ready));
             assert_eq!(met(Ready, TaskPhase::Running, ready), ready != Some(false));
-            for phase in [TaskPhase::Pending, TaskPhase::Starting, TaskPhase::Unknown, TaskPhase::Failed] {
+            for phase in
+                [TaskPhase::Pending, TaskPhase::Starting, TaskPhase::Unknown, TaskPhase::Failed]
+            {
                 for condition in [Running, Ready, Succeeded] {
                     assert!(!met(condition, phase, ready), "{condition:?} {phase:?}");
                 }

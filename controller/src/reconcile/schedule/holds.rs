@@ -10,8 +10,8 @@ use muster_controller_core::hold::Hold;
 use muster_controller_core::schedule::Wait;
 
 use super::{Scheduler, Waiting};
-use crate::{configs, depends};
 use crate::store::Key;
+use crate::{configs, depends};
 
 impl Scheduler {
     /// Why a task is not considered for a place, by what the store says now.

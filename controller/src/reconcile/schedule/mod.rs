@@ -42,7 +42,7 @@ use crate::configs;
 use crate::context::Context;
 use crate::objects::{self, LEASES, NODES, QUOTAS, TASKS};
 use crate::session::poses::LivePoses;
-use crate::store::{Change, Event, Stored, Watcher};
+use crate::store::{Change, Event, Key, Stored, Watcher};
 
 /// How often changed numbers in a waiting task's reasons are written. New reasons are written at
 /// once; a reason whose numbers move with every bind would write without end.
@@ -140,6 +140,8 @@ pub struct Scheduler {
     desk: Desk,
     moves: Moves,
     waiting: HashMap<TaskUid, Waiting>,
+    /// Who waited for a task when it was looked at last, by that task's key.
+    dependents: HashMap<Key, BTreeSet<TaskUid>>,
     /// When waiting tasks are looked at again even if nothing changes.
     look_again: Option<Instant>,
     /// The store failed: robots that move are no reason to try again before.
@@ -169,6 +171,7 @@ impl Scheduler {
             cluster: Cluster::new(),
             moves: Moves::new(poses),
             waiting: HashMap::new(),
+            dependents: HashMap::new(),
             look_again: None,
             binds_after: None,
             specs: Recent::default(),
@@ -270,6 +273,7 @@ impl Scheduler {
     fn take_in(&mut self, resource: crate::store::Resource, change: Change, stored: &Arc<Stored>) {
         if resource == TASKS {
             self.take_in_task(change, stored);
+            self.look_at_dependents(&stored.key);
         } else if resource == NODES {
             self.take_in_node(change, stored);
         } else if resource == QUOTAS {

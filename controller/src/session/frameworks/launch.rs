@@ -10,7 +10,6 @@ use muster_controller_core::offer::OfferId;
 use serde_json::{Value, json};
 
 use super::{convert, subscribe};
-use crate::configs;
 use crate::context::Context;
 use crate::objects::TASKS;
 use crate::quota::Pass;
@@ -18,6 +17,7 @@ use crate::reconcile::desk::{FrameworkUid, Prepared};
 use crate::rest::create;
 use crate::rest::failure::Failure;
 use crate::store::{Key, Op};
+use crate::{configs, depends};
 
 /// Checks everything that can be checked without the ledger; all that is wrong is said at once.
 pub(super) fn prepare(
@@ -117,11 +117,12 @@ fn task_of(
     let object = create::prepare_object(context, TASKS, object).map_err(refused)?;
     let task: Task =
         serde_json::from_value(object.clone()).map_err(|error| wrong("spec", error.to_string()))?;
-    let holds =
-        configs::holds(&context.store, framework.namespace().unwrap_or_default(), &task.spec);
+    let namespace = framework.namespace().unwrap_or_default();
+    let mut holds = depends::holds(&context.store, namespace, &task.spec);
+    holds.extend(configs::holds(&context.store, namespace, &task.spec));
     if !holds.is_empty() {
         let cause = |hold: &Hold| wire::Cause {
-            field: "spec.run".to_owned(),
+            field: hold.field().to_owned(),
             message: format!("{}: {hold}", hold.reason()),
         };
         return Err(holds.iter().map(cause).collect());
