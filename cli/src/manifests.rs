@@ -1,11 +1,12 @@
 //! Files → checked objects. Everything is checked before anything is sent, and every problem is
 //! found at once, each with file, line and column.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::io::Read;
 use std::path::{Path, PathBuf};
 use std::rc::Rc;
 
+use muster_api::kind::task::depend::{self, Graph};
 use muster_api::kind::{self, KindInfo};
 use muster_api::manifest::{self, Diagnostic, Document, Location};
 use muster_api::validate::{Violation, Violations, element_path};
@@ -121,6 +122,7 @@ fn load_from(
         }
     }
     problems.extend(duplicates(&manifests));
+    problems.extend(rings(&manifests));
     if !problems.is_empty() {
         return Err(CliError::Manifests(problems));
     }
@@ -272,6 +274,38 @@ fn duplicates(manifests: &[Manifest]) -> Vec<Diagnostic> {
     problems
 }
 
+/// Tasks that wait for each other, said at the first of each ring.
+fn rings(manifests: &[Manifest]) -> Vec<Diagnostic> {
+    let mut graphs: BTreeMap<&Option<String>, Graph> = BTreeMap::new();
+    let tasks = || manifests.iter().filter(|m| m.info.kind == "Task");
+    let named = |task: &Manifest| -> Vec<String> {
+        let all = task.admitted["spec"]["dependsOn"].as_array().into_iter().flatten();
+        all.filter_map(|one| one["task"].as_str().map(str::to_owned)).collect()
+    };
+    for task in tasks() {
+        graphs.entry(&task.namespace).or_default().insert(task.name.clone(), named(task));
+    }
+    let mut told: BTreeSet<(&Option<String>, String)> = BTreeSet::new();
+    let mut problems = Vec::new();
+    for task in tasks() {
+        if told.contains(&(&task.namespace, task.name.clone())) {
+            continue;
+        }
+        let Some(ring) = depend::cycle(&graphs[&task.namespace], &task.name) else { continue };
+        told.extend(ring.iter().map(|name| (&task.namespace, name.clone())));
+        let at = named(task).iter().position(|name| Some(name) == ring.get(1)).unwrap_or(0);
+        let mut violations = Violations::new();
+        violations
+            .invalid(
+                format!("{}.task", element_path("spec.dependsOn", at)),
+                format!("{} {}", task.title(), depend::ring_text(&ring)),
+            )
+            .suggest("leave out one of them");
+        problems.extend(violations.into_iter().map(|v| task.part.at(v)));
+    }
+    problems
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -297,6 +331,22 @@ mod tests {
         assert_eq!(all[0].admitted["spec"]["gracePeriodSeconds"], 10);
         assert_eq!(all[0].written["spec"].get("gracePeriodSeconds"), None);
         assert_eq!(all[0].title(), "task/a");
+    }
+
+    #[test]
+    fn tasks_that_wait_for_each_other_are_refused_at_their_place() {
+        let task = |name: &str, on: &str| {
+            format!(
+                "apiVersion: muster.dev/v1alpha1\nkind: Task\nmetadata: {{name: {name}}}\nspec:\n  run: {{process: {{command: [x]}}}}\n  dependsOn:\n  - task: {on}\n---\n"
+            )
+        };
+        let all = [task("a", "b"), task("b", "c"), task("c", "a"), task("d", "a")].concat();
+        assert_eq!(
+            problems(&all),
+            [
+                "<stdin>:7:5: spec.dependsOn[0].task: task/a waits for itself: a → b → c → a; leave out one of them"
+            ]
+        );
     }
 
     #[test]

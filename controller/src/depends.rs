@@ -44,7 +44,12 @@ pub(crate) fn holds(store: &Store, namespace: &str, spec: &TaskSpec) -> Vec<Hold
 /// The same when `objects`, manifests that were admitted, are stored as well: a task among them is there, and has not
 /// begun.
 #[must_use]
-pub(crate) fn holds_with(store: &Store, objects: &[Value], namespace: &str, spec: &TaskSpec) -> Vec<Hold> {
+pub(crate) fn holds_with(
+    store: &Store,
+    objects: &[Value],
+    namespace: &str,
+    spec: &TaskSpec,
+) -> Vec<Hold> {
     let planned = |name: &str| {
         objects.iter().any(|object| {
             let there = object["metadata"]["namespace"].as_str().unwrap_or(DEFAULT);

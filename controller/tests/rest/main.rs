@@ -4,6 +4,7 @@
 mod access;
 mod agent;
 mod config;
+mod dependencies;
 mod fencing;
 mod fleet;
 mod objects;

@@ -3,6 +3,7 @@
 mod cli;
 mod config;
 mod demo;
+mod dependencies;
 mod examples;
 mod fence;
 mod figure4;

@@ -119,7 +119,8 @@ mod tests {
         assert!(told(&mut task, standing(None, 1)).contains(&Effect::Launch(1)));
         let _ = launched(&mut task);
         // One that goes down does not take this one with it.
-        assert_eq!(told(&mut task, standing(Some("is Starting"), 1)), [Effect::Persist]);
+        let effects = told(&mut task, standing(Some("is Starting"), 1));
+        assert_eq!(effects, [Effect::Persist, Effect::Publish]);
         assert_eq!(task.report.content.phase, Phase::Running);
     }
 

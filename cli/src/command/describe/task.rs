@@ -1,6 +1,7 @@
 //! A task: what it is, where it may run, what it needs and has, why it waits.
 
 use jiff::Timestamp;
+use muster_api::kind::task::depend::DependsOn;
 use muster_api::kind::task::{
     ContainerRun, EnvFrom, EnvVar, Files, Placement, ProcessRun, Resources, Task, TaskSpec,
     TaskStatus,
@@ -19,6 +20,7 @@ pub(super) fn describe(sheet: &mut Sheet, task: &Task, now: Timestamp) {
     let status = task.status.clone().unwrap_or_default();
     state(sheet, task, &status, now);
     placement(sheet, &task.spec.placement);
+    sheet.list("Depends on", task.spec.depends_on.iter().map(dependency));
     resources(sheet, &task.spec.resources, &status);
     program(sheet, &task.spec);
     super::probes::describe(sheet, &task.spec, &status);
@@ -51,6 +53,12 @@ fn state(sheet: &mut Sheet, task: &Task, status: &TaskStatus, now: Timestamp) {
     sheet.maybe("Started", status.started_at.as_ref().map(|t| when(t.0, now)));
     sheet.maybe("Ended", status.finished_at.as_ref().map(|t| when(t.0, now)));
     sheet.maybe("Exit", some(&columns::exit(status)));
+}
+
+/// `camera (Ready, restarts with it)`.
+fn dependency(on: &DependsOn) -> String {
+    let restarts = if on.restart { ", restarts with it" } else { "" };
+    format!("{} ({:?}{restarts})", on.task, on.condition)
 }
 
 /// Of a running task: whether it serves.
