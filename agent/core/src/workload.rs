@@ -479,7 +479,7 @@ impl Workload {
             self.unused = true;
             let reason = Reason::Runtime("LaunchUnclear".to_owned());
             self.wait(reason, "its launch ended without an answer", context, effects);
-        } else if self.in_contact(context) {
+        } else if self.in_contact(context) && self.desired.depends.is_empty() {
             // The same number: nothing of it ever ran.
             self.launch(effects);
         } else {

@@ -4,6 +4,7 @@
 
 use std::collections::BTreeMap;
 
+use muster_agent_core::depend::{Dependency, Standing};
 use muster_agent_core::desired::{Desired, RestartPolicy, StopOrder};
 use muster_agent_core::observed::{End, Exit, Loss, Observed, Started};
 use muster_agent_core::probe::{Probes, Role, Timing, Verdict};
@@ -13,6 +14,7 @@ use muster_agent_core::workload::{
     Context, Effect, Event, Failure, Fetch, Outcome, Response, State, Workload,
 };
 use muster_api::id::TaskUid;
+use muster_api::kind::task::depend::DependencyCondition;
 use proptest::prelude::*;
 
 const TIMING: Timing =
@@ -39,6 +41,8 @@ enum Action {
     /// The program ends by itself.
     Ends(i32),
     Pass(u64),
+    /// The task that it waits for stands so: whether it has come far enough, and its attempt.
+    Others(bool, u32),
     /// The probes of the attempt that is this many before the present one say something.
     Probed(u32, Verdict),
     Stop(u64),
@@ -60,6 +64,7 @@ fn action() -> impl Strategy<Value = Action> {
         4 => prop_oneof![Just(0), Just(1)].prop_map(Action::Ends),
         4 => (1..400_000_u64).prop_map(Action::Pass),
         3 => (0..2_u32, verdict()).prop_map(|(ago, verdict)| Action::Probed(ago, verdict)),
+        3 => (any::<bool>(), 1..4_u32).prop_map(|(met, attempt)| Action::Others(met, attempt)),
         1 => (0..20_000_u64).prop_map(Action::Stop),
         1 => Just(Action::Unassign),
         1 => Just(Action::Forget),
@@ -117,11 +122,32 @@ struct World {
     crash_after: Option<usize>,
     stopping: bool,
     dropped: bool,
+    /// What was said last of the task that it waits for, in this life of the agent.
+    met: bool,
+    /// An answer to a Prepare is being given: what it leads to was decided before.
+    prepared: bool,
 }
 
 impl World {
     fn new(policy: RestartPolicy, fetch: Fetch) -> World {
-        let desired = Desired { restart: policy, probes: PROBES, ..Desired::once(1_000) };
+        World::with(policy, fetch, Vec::new())
+    }
+
+    /// Waits for another task, and begins anew when that does.
+    fn waiting(policy: RestartPolicy, fetch: Fetch) -> World {
+        let other = Dependency {
+            task: "other".to_owned(),
+            uid: "o".to_owned(),
+            condition: DependencyCondition::Running,
+            restart: true,
+            unmet: None,
+            attempt: 1,
+        };
+        World::with(policy, fetch, vec![other])
+    }
+
+    fn with(policy: RestartPolicy, fetch: Fetch, depends: Vec<Dependency>) -> World {
+        let desired = Desired { restart: policy, probes: PROBES, depends, ..Desired::once(1_000) };
         let mut world = World {
             now: 0,
             fetch,
@@ -136,6 +162,8 @@ impl World {
             crash_after: None,
             stopping: false,
             dropped: false,
+            met: false,
+            prepared: false,
         };
         let (workload, response) =
             Workload::assigned(TaskUid::new("t"), desired, fetch, world.context());
@@ -192,7 +220,13 @@ impl World {
                     self.dropped = true;
                     self.durable = None;
                 }
-                effect => self.under_way.push(effect),
+                effect => {
+                    if matches!(effect, Effect::Launch(_)) && !self.prepared {
+                        let waits = !self.desired.depends.is_empty();
+                        assert!(self.met || !waits, "begins before the other has come so far");
+                    }
+                    self.under_way.push(effect);
+                }
             }
         }
     }
@@ -257,8 +291,9 @@ impl World {
                 if fail {
                     return self.answer(attempt, Outcome::PrepareFailed(failure));
                 }
-                self.missing = false;
+                (self.missing, self.prepared) = (false, true);
                 self.answer(attempt, Outcome::Prepared);
+                self.prepared = false;
             }
             Effect::Launch(attempt) => {
                 self.under_way.remove(index);
@@ -312,7 +347,7 @@ impl World {
     /// The agent dies and comes back; the task's processes do not care.
     fn crash(&mut self) {
         self.under_way.clear();
-        self.agent = None;
+        (self.agent, self.met, self.prepared) = (None, false, false);
         if self.dropped {
             return;
         }
@@ -392,6 +427,15 @@ impl World {
                     assert!(now == ready || started, "ready before it has started");
                 }
             }
+            Action::Others(met, attempt) => {
+                if self.desired.depends.is_empty() || self.agent.is_none() {
+                    return;
+                }
+                self.met = met;
+                let unmet = (!met).then(|| "waits".to_owned());
+                let attempts = BTreeMap::from([("other".to_owned(), ("o".to_owned(), attempt))]);
+                self.handle(Event::Dependencies(Standing { unmet, attempts }));
+            }
             Action::Stop(grace_ms) => {
                 self.desired.stop = Some(StopOrder { grace_ms, reason: "Deleted".to_owned() });
                 self.handle(Event::Assigned(self.desired.clone()));
@@ -426,9 +470,11 @@ proptest! {
     fn a_task_runs_once_at_a_time_and_ends_when_told(
         policy in policy(),
         fetch in fetch(),
+        waits in any::<bool>(),
         actions in prop::collection::vec(action(), 1..60),
     ) {
-        let mut world = World::new(policy, fetch);
+        let begin = if waits { World::waiting } else { World::new };
+        let mut world = begin(policy, fetch);
         for action in actions {
             world.act(action);
             prop_assert!(world.live() <= 1);
