@@ -60,6 +60,9 @@ pub const AVAILABLE: &str = "Available";
 /// Of a TaskSet: its tasks are, or are becoming, what the template says.
 pub const PROGRESSING: &str = "Progressing";
 
+/// Of a TaskSet: some of its tasks cannot be created.
+pub const REPLICA_FAILURE: &str = "ReplicaFailure";
+
 /// Sets the condition of the same type, or adds it; the transition time moves only when the status
 /// changes. Says whether anything changed.
 pub fn set_condition(conditions: &mut Vec<Condition>, mut new: Condition, now: &Time) -> bool {

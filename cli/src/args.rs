@@ -66,7 +66,7 @@ pub(crate) enum Command {
     Get(get::Args),
     /// Show everything about objects
     Describe(describe::Args),
-    /// Say where a task runs and why, or what keeps it from running; why a framework is not offered a node
+    /// Say where a task runs and why, or what keeps it from running; why a framework is not offered a node; what of a task set does not serve
     Why(why::Args),
     /// Show what frameworks are offered now
     Offers(offers::Args),
@@ -194,6 +194,7 @@ mod tests {
             "muster wait node/r --for=jsonpath={.status.free.cpu}=2",
             "muster why task/x",
             "muster why framework/x",
+            "muster why taskset/x",
             "muster offers",
             "muster offers deliver -w -o json",
             "muster offers -A",

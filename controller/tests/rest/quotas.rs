@@ -146,8 +146,20 @@ async fn a_set_makes_as_many_as_there_is_room_for() {
             refused.any(|e| e["message"].as_str().is_some_and(|m| m.contains("200m are left")))
         })
         .await;
+    cluster
+        .until(&format!("{SETS}/crowd"), |set| {
+            let all = set["status"]["conditions"].as_array().into_iter().flatten();
+            all.into_iter().any(|c| c["type"] == "ReplicaFailure" && c["status"] == "True")
+        })
+        .await;
     let raised = json!({"spec": {"hard": {"cpu": "2"}}});
     assert_eq!(send(&admin, "PATCH", &format!("{QUOTAS}/default"), raised).await.0, 200);
     cluster.until(TASKS, |list| count(list) == Some(4)).await;
+    cluster
+        .until(&format!("{SETS}/crowd"), |set| {
+            let all = set["status"]["conditions"].as_array().into_iter().flatten();
+            all.into_iter().all(|c| c["type"] != "ReplicaFailure")
+        })
+        .await;
     cluster.running.shut_down().await.unwrap();
 }

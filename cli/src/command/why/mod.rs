@@ -1,15 +1,17 @@
-//! `muster why`: where a task runs and why there, how it ended, or, per node, what refuses it; and why nodes are not
-//! offered to a framework.
+//! `muster why`: where a task runs and why there, how it ended, or, per node, what refuses it; why nodes are not
+//! offered to a framework; and what of a TaskSet does not serve.
 
 mod framework;
 mod task;
+mod taskset;
 
 use muster_api::kind::task::NodeRefusal;
+use muster_api::kind::taskset::SET_LABEL;
 use serde::Deserialize;
 use serde_json::Value;
 
 use super::Outcome;
-use crate::client::path;
+use crate::client::{Selection, path};
 use crate::error::CliError;
 use crate::exit;
 use crate::output::objects::{Format, document};
@@ -21,7 +23,7 @@ use crate::target::{self, Named};
 /// `muster why`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
-    /// The task, NAME or task/NAME; or framework/NAME
+    /// The task, NAME or task/NAME; or framework/NAME, or taskset/NAME
     object: String,
     /// Print what the controller says, for programs
     #[arg(short, long, value_enum, value_name = "FORMAT")]
@@ -53,14 +55,19 @@ impl Asked<'_> {
 }
 
 pub(crate) async fn run(args: Args, session: &mut Session) -> Outcome {
-    let named = target::one_of(&args.object, &["task", "framework"])?;
+    let named = target::one_of(&args.object, &["task", "framework", "taskset"])?;
     let asked = ask(&named, session).await?;
+    let of_set = match named.info.kind {
+        "TaskSet" => tasks_of(asked.name, session).await?,
+        _ => Vec::new(),
+    };
     let read = |source| CliError::Answer {
         server: session.client.server.clone(),
         request: args.object.clone(),
         source,
     };
     let (text, value) = match named.info.kind {
+        "TaskSet" => taskset::told(&asked, &of_set, &session.ui.styles).map_err(read)?,
         "Framework" => framework::told(&asked, &session.ui.styles).map_err(read)?,
         _ => task::told(&asked, &session.ui.styles).map_err(read)?,
     };
@@ -84,6 +91,14 @@ async fn ask<'a>(named: &Named<'a>, session: &Session) -> Result<Asked<'a>, CliE
         Err(error) => return Err(error),
     };
     Ok(Asked { name, object, answer })
+}
+
+/// The tasks of a set.
+async fn tasks_of(set: &str, session: &Session) -> Result<Vec<Value>, CliError> {
+    let selection = Selection { labels: Some(format!("{SET_LABEL}={set}")), fields: None };
+    let namespace = Some(session.namespace.as_str());
+    let list = session.client.list(target::kind("task")?, namespace, &selection).await?;
+    Ok(list.items)
 }
 
 fn why_path(named: &Named<'_>, namespace: Option<&str>) -> String {

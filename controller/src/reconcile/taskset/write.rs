@@ -3,10 +3,12 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use k8s_openapi::apimachinery::pkg::apis::meta::v1::{ObjectMeta, OwnerReference};
+use jiff::Timestamp;
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::{ObjectMeta, OwnerReference, Time};
+use muster_api::condition::{Condition, ConditionStatus, REPLICA_FAILURE, set_condition};
 use muster_api::kind::node::Node;
 use muster_api::kind::task::Task;
-use muster_api::kind::taskset::{CHANGE_CAUSE, SET_LABEL, TaskSet, TaskTemplate};
+use muster_api::kind::taskset::{CHANGE_CAUSE, SET_LABEL, TaskSet, TaskSetStatus, TaskTemplate};
 use muster_api::kind::taskset_revision::{TaskSetRevision, TaskSetRevisionSpec};
 use muster_controller_core::taskset::{Action, NewTask, News, Place, Plan};
 
@@ -46,29 +48,33 @@ pub(super) async fn carry_out(
     set: &TaskSet,
     plan: &Plan,
 ) -> Result<Outcome, StoreError> {
-    let same = set.status.as_ref() == Some(&plan.status);
-    if same && plan.actions.is_empty() {
-        return Ok(Outcome::Done);
+    let mut work = Work { context, stored, set, passes: Vec::new(), kept_out: BTreeMap::new() };
+    let more = match work.operations(plan) {
+        Ok(more) => more,
+        Err(Stop::Raced) => return Ok(Outcome::Raced),
+        Err(Stop::Refused(failure)) => return Ok(Outcome::Refused(failure.message().to_owned())),
+    };
+    let refused = work.kept_out.values().next().cloned();
+    let mut status = plan.status.clone();
+    say_failure(&mut status, refused.as_deref(), context.clock.now());
+    let same = set.status.as_ref() == Some(&status);
+    let outcome = refused.map_or(Outcome::Done, Outcome::Refused);
+    if same && more.is_empty() {
+        return Ok(outcome);
     }
     // Everything holds only while the set is what the plan was made for.
     let mut ops = vec![match same {
-        false => Op::status(stored, &plan.status),
+        false => Op::status(stored, &status),
         true => Op::Check {
             key: stored.key.clone(),
             precondition: Precondition::revision(stored.revision),
         },
     }];
-    let mut work = Work { context, stored, set, passes: Vec::new(), kept_out: BTreeMap::new() };
-    match work.operations(plan) {
-        Ok(more) => ops.extend(more),
-        Err(Stop::Raced) => return Ok(Outcome::Raced),
-        Err(Stop::Refused(failure)) => return Ok(Outcome::Refused(failure.message().to_owned())),
-    }
+    ops.extend(more);
     match context.store.apply(ops).await {
         Ok(_) => {
             tell(context, set, plan, &work.kept_out);
-            let refused = work.kept_out.into_values().next();
-            Ok(refused.map_or(Outcome::Done, Outcome::Refused))
+            Ok(outcome)
         }
         Err(error) if objects::is_race(&error) => {
             tracing::debug!(set = %stored.key, %error, "a look at a task set came too late");
@@ -76,6 +82,22 @@ pub(super) async fn carry_out(
         }
         Err(error) => Err(error),
     }
+}
+
+/// Whether tasks of the set could not be created, as in Kubernetes: there while it is so.
+fn say_failure(status: &mut TaskSetStatus, why: Option<&str>, now: Timestamp) {
+    let Some(why) = why else {
+        status.conditions.retain(|c| c.r#type != REPLICA_FAILURE);
+        return;
+    };
+    let condition = Condition {
+        r#type: REPLICA_FAILURE.to_owned(),
+        status: ConditionStatus::True,
+        reason: "FailedCreate".to_owned(),
+        message: why.to_owned(),
+        last_transition_time: None,
+    };
+    set_condition(&mut status.conditions, condition, &Time(now));
 }
 
 /// What operations are made of.
