@@ -23,6 +23,8 @@ pub(crate) struct Entry {
     /// What the report says is known in this life of the agent, and not only remembered.
     pub(crate) known: bool,
     pub(crate) runtime: Arc<dyn Runtime>,
+    /// `namespace/name`.
+    pub(crate) title: String,
     /// Memory that its spec reserves, bytes.
     pub(crate) reserved: u64,
     /// The last usage that was told.
@@ -51,7 +53,12 @@ impl Board {
         self.entries.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    pub(crate) fn publish(&self, workload: &Workload, runtime: &Arc<dyn Runtime>, reserved: u64) {
+    pub(crate) fn publish(
+        &self,
+        (workload, title): (&Workload, &str),
+        runtime: &Arc<dyn Runtime>,
+        reserved: u64,
+    ) {
         let Workload { uid, report, attempt, .. } = workload;
         let (attempt, known) = (*attempt, !matches!(workload.state, State::Recovering { .. }));
         let mut entries = self.entries();
@@ -70,6 +77,7 @@ impl Board {
                     attempt,
                     known,
                     runtime: Arc::clone(runtime),
+                    title: title.to_owned(),
                     reserved,
                     sample: None,
                 };
@@ -119,6 +127,13 @@ impl Board {
             .iter()
             .map(|(uid, entry)| (uid.clone(), entry.report.clone(), entry.acked))
             .collect()
+    }
+
+    /// The tasks that have not ended, with their `namespace/name`.
+    pub(crate) fn live(&self) -> Vec<(TaskUid, String)> {
+        let entries = self.entries();
+        let live = entries.iter().filter(|(_, entry)| !entry.report.content.phase.is_terminal());
+        live.map(|(uid, entry)| (uid.clone(), entry.title.clone())).collect()
     }
 
     /// The task's runtime and present attempt.

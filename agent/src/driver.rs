@@ -215,7 +215,8 @@ fn publish(shared: &Shared, record: &Record) {
     let (workload, runtime) = (&record.workload, shared.runtime(record));
     let reserved = record.assignment.spec.resources.memory.map_or(0, |memory| memory.0);
     let board = &shared.board;
-    board.publish(workload, runtime, reserved);
+    let title = format!("{}/{}", record.assignment.namespace, record.assignment.name);
+    board.publish((workload, &title), runtime, reserved);
 }
 
 fn context(shared: &Shared) -> Context {

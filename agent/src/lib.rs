@@ -20,6 +20,7 @@
 //! | `gauge` | what is read off the machine: battery, disk, labels |
 //! | `footprint` | memory that is given back after the start |
 //! | `contact` | when the controller was last heard, for the shims too |
+//! | `mission` | mission locks that are set on the robot itself |
 //! | `link` | joining, the session, logs on request |
 //! | `node`, `capacity`, `position` | what this node is, has, and where it is |
 //! | `probe` | checks of running tasks |
@@ -41,6 +42,7 @@ mod footprint;
 mod gauge;
 mod given;
 mod link;
+mod mission;
 mod node;
 mod position;
 mod probe;

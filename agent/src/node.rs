@@ -1,6 +1,7 @@
 //! What this node is and has, as the controller is told.
 
 use std::collections::BTreeMap;
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -19,6 +20,7 @@ use crate::driver::Shared;
 use crate::gauge::battery::{BatteryGauge, BatterySource};
 use crate::gauge::disk::DiskGauge;
 use crate::gauge::machine;
+use crate::mission;
 use crate::position::Position;
 
 /// Between two live poses. A robot at 1.5 m/s moves 15 cm in it, less than placement by distance can care for.
@@ -33,6 +35,7 @@ pub(crate) struct Node {
     position: Option<Position>,
     battery: Option<BatteryGauge>,
     disk: DiskGauge,
+    data_dir: PathBuf,
     machine: Machine,
     told: Option<proto::NodeState>,
     told_pose: Option<Pose>,
@@ -70,6 +73,7 @@ impl Node {
             speed: config.speed,
             address: facts.address,
             battery: None,
+            mission_locks: Vec::new(),
         };
         let position = match facts.kind {
             Kind::Robot => config.position.as_ref().map(|source| source.open(&config.map)),
@@ -89,6 +93,7 @@ impl Node {
             position,
             battery,
             disk,
+            data_dir: config.data_dir.clone(),
             machine,
             told: None,
             told_pose: None,
@@ -133,7 +138,10 @@ impl Node {
             conditions.push(condition(LOCALIZED, localized, reason, String::new()));
         }
         let battery = self.battery.as_ref().and_then(BatteryGauge::charge);
-        let report = NodeReport { runtimes, conditions, battery, ..self.fixed.clone() };
+        let mission_locks =
+            mission::locks(&self.data_dir, &self.shared.checkpoint, self.shared.board.live());
+        let report =
+            NodeReport { runtimes, conditions, battery, mission_locks, ..self.fixed.clone() };
         let mut state = proto::NodeState::from(&report);
         state.boot_id.clone_from(&self.boot_id);
         state

@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 
 use muster_api::kind::namespace::DEFAULT;
-use muster_api::kind::task::depend::{self, Graph};
+use muster_api::kind::task::depend::{self, DependencyCondition, Graph};
 use muster_api::kind::task::{Task, TaskSpec, TaskStatus};
 use muster_api::validate::{Violations, element_path};
 use muster_api::wire::agent::v1 as wire;
@@ -77,8 +77,11 @@ pub(crate) fn to_wire(store: &Store, namespace: &str, spec: &TaskSpec) -> Vec<wi
             ..wire::Dependency::default()
         };
         match task {
-            // Gone after it was waited for: it had come far enough when this task was placed.
-            None => told.met = true,
+            // One that has succeeded may be removed. Another one must be there again.
+            None => {
+                told.met = one.condition == DependencyCondition::Succeeded;
+                told.unmet = "is not there".to_owned();
+            }
             Some(task) => {
                 let status = task.status.unwrap_or_default();
                 told.uid = task.metadata.uid.unwrap_or_default();
@@ -90,6 +93,11 @@ pub(crate) fn to_wire(store: &Store, namespace: &str, spec: &TaskSpec) -> Vec<wi
         told
     };
     spec.depends_on.iter().map(dependency).collect()
+}
+
+fn has_ended(task: &Value) -> bool {
+    let phase = task["status"]["phase"].as_str();
+    phase.is_some_and(|phase| phase == "Succeeded" || phase == "Failed")
 }
 
 /// Refuses a new task that would wait for itself.
@@ -115,7 +123,9 @@ pub(crate) fn check(store: &Store, object: &Value) -> Result<(), Violations> {
             continue;
         }
         let stored = store.get(&key_of(namespace, &next)).filter(|s| s.mentions("dependsOn"));
-        let more = stored.map(|stored| named(&stored.value())).unwrap_or_default();
+        // What has ended waits for nobody.
+        let value = stored.map(|stored| stored.value()).filter(|task| !has_ended(task));
+        let more = value.as_ref().map(named).unwrap_or_default();
         left.extend(more.iter().cloned());
         graph.insert(next, more);
     }

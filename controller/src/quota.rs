@@ -174,9 +174,13 @@ impl Door {
         uid: &str,
         resources: &Resources,
     ) -> Result<Option<Pass>, Violations> {
-        let Some(quota) = of(store, namespace) else { return Ok(None) };
-        let (uid, asked) = (TaskUid::new(uid), asked(resources));
         let mut counts = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        let Some(quota) = of(store, namespace) else {
+            // What passed before the quota went is committed or not: nobody asks any more.
+            counts.namespaces.remove(namespace);
+            return Ok(None);
+        };
+        let (uid, asked) = (TaskUid::new(uid), asked(resources));
         let counted = counts.of(store, namespace);
         let mut violations = Violations::new();
         for refusal in refusals(&quota, &counted.sum(), &asked) {

@@ -78,7 +78,11 @@ impl Standing {
     pub fn restarted_since(&self, before: &BTreeMap<String, (String, u32)>) -> Option<&str> {
         let newer = |task: &&String| {
             let (uid, attempt) = &self.attempts[*task];
-            before.get(*task).is_none_or(|(old, begun)| old != uid || begun < attempt)
+            match before.get(*task) {
+                Some((old, begun)) if old == uid => begun < attempt,
+                // Another task of that name; it may not have begun yet.
+                Some(_) | None => *attempt > 0,
+            }
         };
         self.attempts.keys().find(newer).map(String::as_str)
     }
@@ -136,6 +140,8 @@ mod tests {
         let mut other = all.clone();
         other[0].uid = "another".to_owned();
         assert_eq!(standing(&other, |_| None).restarted_since(&before), Some("a"));
+        other[0].attempt = 0;
+        assert_eq!(standing(&other, |_| None).restarted_since(&before), None, "not begun yet");
         other[0].uid = String::new();
         assert_eq!(standing(&other, |_| None).restarted_since(&before), None, "it is gone");
         let mut quiet = all;

@@ -150,7 +150,7 @@ pub struct Workload {
     /// What its probes have found of the current attempt.
     #[serde(default)]
     pub verdicts: Verdicts,
-    /// The current attempt is to be ended, because a probe failed.
+    /// The current attempt is to be ended: a probe failed, or a task that it follows was started again.
     #[serde(default)]
     pub condemned: Option<Condemned>,
     /// How the tasks stand that it waits for; none: they are still to be looked at.
@@ -337,7 +337,13 @@ impl Workload {
         match (&self.state, outcome) {
             (State::Preparing, Outcome::Prepared) => {
                 self.fetched = true;
-                self.launch(effects);
+                if self.waits_for_others() {
+                    // One of them went down meanwhile.
+                    self.unused = true;
+                    self.state = State::Waiting { until: context.now.boot };
+                } else {
+                    self.launch(effects);
+                }
             }
             // It will not be fetched for ever: what is still missing then is a failure.
             (State::Launching, Outcome::Unprepared(failure))
@@ -354,6 +360,7 @@ impl Workload {
             | (State::Recovering { .. }, Outcome::Found(Observed::Running(started))) => {
                 self.state = State::Running { started };
                 effects.push(Effect::Watch(self.attempt));
+                self.follow_others();
                 self.end_if_wanted(context, effects);
             }
             (State::Launching, Outcome::LaunchUnclear) => {
@@ -532,9 +539,14 @@ impl Workload {
         }
         let again = self.runs_again(exit);
         let condemned = self.condemned.take();
+        let follows = matches!(condemned, Some(Condemned::Dependency { .. }));
         if again {
             self.restarts += 1;
             content.restarts = self.restarts;
+            if follows {
+                // It was ended for another task, however its program took that.
+                (content.exit_code, content.signal) = (None, None);
+            }
         } else {
             let well = exit.succeeded() && condemned.is_none();
             content.phase = if well { Phase::Succeeded } else { Phase::Failed };
@@ -542,7 +554,6 @@ impl Workload {
         let (reason, message) = (content.reason.clone(), content.message.clone());
         self.report.update(content);
         if again {
-            let follows = matches!(condemned, Some(Condemned::Dependency { .. }));
             if !follows {
                 self.failures = restart::failures_after(self.failures, exit);
             }

@@ -124,8 +124,6 @@ struct World {
     dropped: bool,
     /// What was said last of the task that it waits for, in this life of the agent.
     met: bool,
-    /// An answer to a Prepare is being given: what it leads to was decided before.
-    prepared: bool,
 }
 
 impl World {
@@ -163,7 +161,6 @@ impl World {
             stopping: false,
             dropped: false,
             met: false,
-            prepared: false,
         };
         let (workload, response) =
             Workload::assigned(TaskUid::new("t"), desired, fetch, world.context());
@@ -221,7 +218,7 @@ impl World {
                     self.durable = None;
                 }
                 effect => {
-                    if matches!(effect, Effect::Launch(_)) && !self.prepared {
+                    if matches!(effect, Effect::Launch(_)) {
                         let waits = !self.desired.depends.is_empty();
                         assert!(self.met || !waits, "begins before the other has come so far");
                     }
@@ -291,9 +288,8 @@ impl World {
                 if fail {
                     return self.answer(attempt, Outcome::PrepareFailed(failure));
                 }
-                (self.missing, self.prepared) = (false, true);
+                self.missing = false;
                 self.answer(attempt, Outcome::Prepared);
-                self.prepared = false;
             }
             Effect::Launch(attempt) => {
                 self.under_way.remove(index);
@@ -347,7 +343,7 @@ impl World {
     /// The agent dies and comes back; the task's processes do not care.
     fn crash(&mut self) {
         self.under_way.clear();
-        (self.agent, self.met, self.prepared) = (None, false, false);
+        (self.agent, self.met) = (None, false);
         if self.dropped {
             return;
         }

@@ -5,8 +5,8 @@
 //! | `sysfs:NAME` | the kernel's driver, `/sys/class/power_supply/NAME/{capacity,status}` |
 //! | `file:PATH` | a line `PERCENT` or `PERCENT charging` that some program of the robot's keeps up to date |
 //!
-//! A source that cannot be read, or says something else, tells nothing: the controller then takes the robot for one
-//! without a battery, and the agent's log says why.
+//! A source that cannot be read for half a minute, or says something else, tells nothing: the controller then takes the
+//! robot for one without a battery, and the agent's log says why.
 
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
@@ -18,6 +18,8 @@ use super::Gauge;
 
 /// A battery loses a percent in minutes.
 const EVERY: Duration = Duration::from_secs(2);
+/// A charge that could not be read this often in a row is not known any more: half a minute.
+const MISSES: u32 = 15;
 
 /// Where the charge is read.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -61,16 +63,8 @@ impl BatterySource {
     /// Starts to read it.
     pub(crate) fn open(&self) -> BatteryGauge {
         let source = self.clone();
-        let read = move |last: Result<Battery, String>| {
-            let new = source.read();
-            if let Err(why) = &new
-                && last != new
-            {
-                tracing::warn!(why, "the robot's battery is not known");
-            }
-            new
-        };
-        BatteryGauge(Gauge::open(EVERY, Err(String::new()), read))
+        let read = move |last: Reading| last.then(source.read());
+        BatteryGauge(Gauge::open(EVERY, Reading::default(), read))
     }
 
     fn read(&self) -> Result<Battery, String> {
@@ -83,6 +77,31 @@ impl BatterySource {
                 Ok(Battery { percent: percent(&capacity)?, charging: status.trim() == "Charging" })
             }
             BatterySource::File(path) => parse(&text(path)?),
+        }
+    }
+}
+
+/// What is known of the charge.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+struct Reading {
+    charge: Option<Battery>,
+    /// How often in a row it could not be read.
+    missed: u32,
+}
+
+impl Reading {
+    /// The last charge counts on for a while: a file that is being written is empty for a moment, and a robot with 3 % is
+    /// not one without a battery.
+    fn then(self, read: Result<Battery, String>) -> Reading {
+        match read {
+            Ok(charge) => Reading { charge: Some(charge), missed: 0 },
+            Err(why) => {
+                let missed = self.missed.saturating_add(1);
+                if missed == MISSES {
+                    tracing::warn!(why, "the robot's battery is not known");
+                }
+                Reading { charge: self.charge.filter(|_| missed < MISSES), missed }
+            }
         }
     }
 }
@@ -106,11 +125,11 @@ fn percent(text: &str) -> Result<u8, String> {
 
 /// Tells the newest charge.
 #[derive(Debug)]
-pub(crate) struct BatteryGauge(Gauge<Result<Battery, String>>);
+pub(crate) struct BatteryGauge(Gauge<Reading>);
 
 impl BatteryGauge {
     pub(crate) fn charge(&self) -> Option<Battery> {
-        self.0.newest().ok()
+        self.0.newest().charge
     }
 }
 
@@ -135,6 +154,20 @@ mod tests {
         for bad in ["", "101", "-1", "NaN", "50 full", "50 charging now"] {
             assert!(parse(bad).is_err(), "{bad:?}");
         }
+    }
+
+    #[test]
+    fn a_charge_counts_until_it_could_not_be_read_for_a_while() {
+        let low = Battery { percent: 3, charging: false };
+        let unreadable = || Err("empty".to_owned());
+        let mut reading = Reading::default().then(Ok(low));
+        for _ in 1..MISSES {
+            reading = reading.then(unreadable());
+            assert_eq!(reading.charge, Some(low));
+        }
+        assert_eq!(reading.clone().then(unreadable()).charge, None);
+        let again = reading.then(Ok(low));
+        assert_eq!(again, Reading { charge: Some(low), missed: 0 });
     }
 
     #[test]

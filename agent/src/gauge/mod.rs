@@ -10,8 +10,8 @@ use tokio::sync::watch;
 use tokio::time::MissedTickBehavior;
 use tokio_util::task::AbortOnDropHandle;
 
-/// The newest reading of something that is read again every so often, on another thread: a file system that hangs must
-/// not stop the agent.
+/// The newest reading of something that is read again every so often, on another thread: a file system that hangs later
+/// must not stop the agent.
 #[derive(Debug)]
 struct Gauge<T> {
     newest: watch::Receiver<T>,
@@ -19,7 +19,8 @@ struct Gauge<T> {
 }
 
 impl<T: Clone + PartialEq + Send + Sync + 'static> Gauge<T> {
-    /// `read` is given the last reading. The first one is made before this returns.
+    /// `read` is given the last reading. The first one is made here, before this returns: what the controller is told first
+    /// must not be less than what it knew.
     fn open(every: Duration, first: T, read: impl Fn(T) -> T + Clone + Send + 'static) -> Self {
         let first = read(first);
         let (say, newest) = watch::channel(first);

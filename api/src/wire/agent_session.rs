@@ -9,7 +9,7 @@ use super::WireError;
 use super::agent::v1 as proto;
 use crate::condition::{Condition, ConditionStatus};
 use crate::kind::node::upkeep::Battery;
-use crate::kind::node::{NodeKind, RuntimeStatus};
+use crate::kind::node::{MissionLock, NodeKind, RuntimeStatus};
 use crate::kind::task::depend::DependencyCondition;
 use crate::kind::task::{TaskSpec, TaskUsage};
 use crate::name::FunctionName;
@@ -208,6 +208,8 @@ pub struct NodeReport {
     pub address: String,
     /// The charge of its battery.
     pub battery: Option<Battery>,
+    /// Mission locks that are set on the node itself.
+    pub mission_locks: Vec<MissionLock>,
 }
 
 impl TryFrom<&proto::NodeState> for NodeReport {
@@ -238,6 +240,14 @@ impl TryFrom<&proto::NodeState> for NodeReport {
                 percent: u8::try_from(battery.percent).unwrap_or(u8::MAX).min(100),
                 charging: battery.charging,
             }),
+            mission_locks: state
+                .mission_locks
+                .iter()
+                .map(|lock| MissionLock {
+                    holder: lock.holder.clone(),
+                    reason: lock.reason.clone(),
+                })
+                .collect(),
         })
     }
 }
@@ -271,6 +281,14 @@ impl From<&NodeReport> for proto::NodeState {
                 percent: battery.percent.into(),
                 charging: battery.charging,
             }),
+            mission_locks: report
+                .mission_locks
+                .iter()
+                .map(|lock| proto::MissionLock {
+                    holder: lock.holder.clone(),
+                    reason: lock.reason.clone(),
+                })
+                .collect(),
         }
     }
 }
@@ -344,6 +362,10 @@ mod tests {
             speed: Some(0.5),
             address: "127.0.0.1".to_owned(),
             battery: Some(Battery { percent: 83, charging: true }),
+            mission_locks: vec![MissionLock {
+                holder: "task default/patrol".to_owned(),
+                reason: "carries a tray".to_owned(),
+            }],
         }
     }
 

@@ -35,7 +35,7 @@ pub(crate) struct Args {
     /// Let the controller check everything, and store nothing
     #[arg(long)]
     dry_run: bool,
-    /// Do what `muster plan` said under this index, or nothing when it would now be something else
+    /// Refuse when this is no longer what `muster plan` said under this index; looked at just before anything is stored
     #[arg(long, value_name = "INDEX")]
     check_index: Option<String>,
     /// Wait until every task runs, has ended, or says why it waits

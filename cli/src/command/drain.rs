@@ -1,11 +1,16 @@
 //! `muster drain`: cordon a node, then end the tasks on it, each within its grace.
 //!
 //! A task is one run: nobody starts it again elsewhere unless something owns it. Drain says which
-//! tasks these are, and which of them drive the robot, before it waits.
+//! tasks these are, and which of them drive the robot, before it waits. A
+//! robot in the middle of a mission is waited for first.
+
+use std::time::Duration;
 
 use muster_api::duration::Span;
+use muster_api::kind::node::Node;
 use muster_api::kind::task::Task;
 use serde_json::Value;
+use tokio::time::Instant;
 
 use super::gone::{Doomed, until_gone};
 use super::{Outcome, cordon};
@@ -16,6 +21,7 @@ use crate::exit;
 use crate::output::human;
 use crate::session::Session;
 use crate::target;
+use crate::watch::{Change, Follow};
 
 /// `muster drain`.
 #[derive(Debug, clap::Args)]
@@ -28,6 +34,9 @@ pub(crate) struct Args {
     /// Wait this long at most [default: for ever]
     #[arg(long, value_name = "TIME", value_parser = span)]
     timeout: Option<Span>,
+    /// End tasks in the middle of a mission too
+    #[arg(long)]
+    ignore_mission_lock: bool,
     /// Only say what would be ended
     #[arg(long)]
     dry_run: bool,
@@ -39,6 +48,9 @@ pub(crate) async fn run(args: Args, session: &mut Session) -> Outcome {
         session.client.get(target::kind("node")?, None, node).await?;
     } else {
         cordon::set(node, true, session).await?;
+    }
+    if !args.dry_run && !args.ignore_mission_lock {
+        until_unlocked(node, args.timeout.map(|t| t.as_duration()), session).await?;
     }
     let tasks = tasks_on(node, session).await?;
     if tasks.is_empty() {
@@ -66,6 +78,46 @@ pub(crate) async fn run(args: Args, session: &mut Session) -> Outcome {
     until_gone(tasks, args.timeout.map(|t| t.as_duration()), session).await?;
     session.ui.line(&format!("node/{node} is drained: {} ended", human::count(count, "task")))?;
     Ok(exit::OK)
+}
+
+/// Waits until the node is on no mission: it is cordoned, so no new one begins there.
+async fn until_unlocked(
+    node: &str,
+    most: Option<Duration>,
+    session: &mut Session,
+) -> Result<(), CliError> {
+    let started = Instant::now();
+    let mut follow =
+        Follow::new(&session.client, target::kind("node")?, None, Selection::name(node));
+    let mut told = None;
+    loop {
+        let change = match most {
+            Some(most) => tokio::time::timeout_at(started + most, follow.next()).await,
+            None => Ok(follow.next().await),
+        };
+        let Ok(change) = change else {
+            return Err(CliError::Timeout {
+                what: format!("the mission on node/{node} to end"),
+                after: started.elapsed(),
+                hint: Some("--ignore-mission-lock ends its tasks all the same".to_owned()),
+            });
+        };
+        let lock = match change? {
+            Change::Applied(object) => {
+                serde_json::from_value::<Node>(object).ok().and_then(|node| node.mission_lock())
+            }
+            Change::Deleted(_) => None,
+            Change::Synced => continue,
+        };
+        let Some(lock) = lock else { return Ok(()) };
+        if told.as_ref() != Some(&lock) {
+            session.ui.line(&format!(
+                "waiting for the mission of {} on node/{node}: {}",
+                lock.holder, lock.reason
+            ))?;
+            told = Some(lock);
+        }
+    }
 }
 
 /// What holds something of the node, in every namespace.

@@ -1,6 +1,7 @@
 //! `muster node lock`, `muster node unlock`: a robot in the middle of a mission keeps the tasks that it has.
 //!
-//! The lock is an annotation of the Node, so anybody who may write nodes sets it, a task with a credential too.
+//! This lock is an annotation of the Node, so anybody who may write nodes sets it, a task with a credential too. On the
+//! robot itself a task sets one by a file in its `$MUSTER_RUN_DIR`, and a person by one in the agent's data directory.
 
 use muster_api::kind::node::{MISSION_LOCK, Node};
 use serde_json::{Value, json};
@@ -42,7 +43,7 @@ pub(crate) async fn lock(args: LockArgs, session: &mut Session) -> Outcome {
         return Err(CliError::usage("--holder is a word without ':'"));
     }
     let present = node(name, session).await?;
-    if let Some(other) = present.mission_lock().filter(|l| l.holder != holder) {
+    if let Some(other) = present.annotated_lock().filter(|l| l.holder != holder) {
         return Err(CliError::Failed {
             what: format!("node/{name} is locked by {} already: {}", other.holder, other.reason),
             hint: Some(format!("`muster node unlock {name}` takes that lock away")),
@@ -57,7 +58,16 @@ pub(crate) async fn lock(args: LockArgs, session: &mut Session) -> Outcome {
 pub(crate) async fn unlock(args: UnlockArgs, session: &mut Session) -> Outcome {
     let name = target::one(&args.node, "node")?.name.unwrap_or_default();
     let present = node(name, session).await?;
-    let Some(lock) = present.mission_lock() else {
+    let local = present.status.iter().flat_map(|status| &status.mission_locks).next();
+    let Some(lock) = present.annotated_lock() else {
+        if let Some(lock) = local {
+            let (holder, reason) = (&lock.holder, &lock.reason);
+            let hint = "it is unlocked there: its file mission-lock is removed, or the task ends";
+            return Err(CliError::Failed {
+                what: format!("node/{name} is locked on the robot itself, by {holder}: {reason}"),
+                hint: Some(hint.to_owned()),
+            });
+        }
         session.ui.line(&format!("node/{name} is not locked"))?;
         return Ok(exit::OK);
     };
@@ -69,6 +79,10 @@ pub(crate) async fn unlock(args: UnlockArgs, session: &mut Session) -> Outcome {
     }
     write(name, Value::Null, session).await?;
     session.ui.line(&format!("node/{name} unlocked"))?;
+    if let Some(local) = local {
+        let line = format!("node/{name} is still locked on the robot itself, by {}", local.holder);
+        session.ui.warn(&line);
+    }
     Ok(exit::OK)
 }
 
@@ -110,5 +124,11 @@ mod tests {
         fake.try_run(&["node", "unlock", "r1", "--holder", "bob"]).await.expect_err("not his");
         assert_eq!(fake.run(&["node", "unlock", "r1"]).await.1, "node/r1 unlocked\n");
         assert_eq!(fake.run(&["node", "unlock", "r1"]).await.1, "node/r1 is not locked\n");
+        fake.edit("nodes/r1", |node| {
+            let lock = json!({"holder": "task default/patrol", "reason": "far away"});
+            node["status"]["missionLocks"] = json!([lock]);
+        });
+        let local = fake.try_run(&["node", "unlock", "r1"]).await.expect_err("set on the robot");
+        assert!(local.to_string().contains("task default/patrol: far away"), "{local}");
     }
 }

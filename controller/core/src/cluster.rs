@@ -89,7 +89,7 @@ impl NodeFacts {
             && is_move(self.pose.as_ref(), other.pose.as_ref())
             && self.runtimes == other.runtimes
             && self.passing == other.passing
-            && self.battery == other.battery
+            && self.battery_lacks() / BATTERY_STEP == other.battery_lacks() / BATTERY_STEP
     }
 }
 

@@ -21,6 +21,7 @@ use muster_api::name::NodeName;
 use muster_api::resource::Compute;
 
 use crate::cluster::{Cluster, Member};
+use crate::fairness::namespace_of;
 use crate::ledger::{NodeLedger, Reservation};
 use crate::report::Refusal;
 use crate::schedule::{Demand, filter, score};
@@ -158,6 +159,15 @@ fn victims(member: &Member, demand: &Demand) -> Option<Vec<TaskUid>> {
     // Work does not end the executor that is to do it.
     let own = reservation.standing.executor.as_ref();
     candidates.retain(|c| own != Some(&c.tasks[0].1.title));
+    // Nor does a task end those that it waits for: it could not begin.
+    let namespace = namespace_of(&demand.title);
+    let waited_for = |title: &str| {
+        let names = demand.spec.depends_on.iter().map(|one| one.task.as_str());
+        title
+            .split_once('/')
+            .is_some_and(|(of, name)| of == namespace && names.clone().any(|n| n == name))
+    };
+    candidates.retain(|c| !c.tasks.iter().any(|(_, r)| waited_for(&r.title)));
     if !need.is_met(&everybody(&candidates)) {
         return None;
     }

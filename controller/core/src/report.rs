@@ -67,6 +67,11 @@ pub enum Refusal {
         /// The taint.
         taint: Taint,
     },
+    /// What is wrong with the node for now puts a taint on it that is not tolerated.
+    OutOfService {
+        /// The taint.
+        taint: Taint,
+    },
     /// The node is cordoned.
     Cordoned,
     /// The agent is not heard, or has not cleaned up what it should not run.
@@ -135,6 +140,7 @@ impl Refusal {
             Refusal::NoActuator { .. } => "NoActuator",
             Refusal::TooSmall { .. } => "TooSmall",
             Refusal::Tainted { .. } => "Tainted",
+            Refusal::OutOfService { .. } => "OutOfService",
             Refusal::Cordoned => "Cordoned",
             Refusal::NotReady { .. } => "NotReady",
             Refusal::NoPose => "NoPose",
@@ -212,6 +218,13 @@ impl fmt::Display for Refusal {
                     write!(f, "={}", taint.value)?;
                 }
                 f.write_str(", which the task does not tolerate")
+            }
+            Refusal::OutOfService { taint } => {
+                write!(
+                    f,
+                    "is out of service for now: {}, which the task does not tolerate",
+                    taint.key
+                )
             }
             Refusal::Cordoned => f.write_str("is cordoned; `muster uncordon` lets tasks in again"),
             Refusal::NotReady { message } if message.is_empty() => f.write_str("is not ready"),

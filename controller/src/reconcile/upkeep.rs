@@ -1,11 +1,12 @@
 //! Says of nodes with batteries and maintenance windows when nothing new begins there, and ends what is to be gone.
 //!
 //! What is so is [`muster_controller_core::upkeep`]'s to decide; here it is written: conditions into the Node's status, and
-//! orders to end into the tasks of a node that is drained. A task that came in the last moment is seen with the Node's next
-//! change, which its reservation makes.
+//! orders to end into the tasks of a node that is drained. A node that is being drained is looked at again every moment, for
+//! tasks that were placed in the last one.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
+use std::time::Duration;
 
 use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::{MicroTime, Time};
@@ -18,6 +19,9 @@ use super::{again, next_events, watch_from_now};
 use crate::context::Context;
 use crate::objects::{self, NODES};
 use crate::store::{Change, Key, Op, StoreError, Stored};
+
+/// Between two looks at a node that is being drained.
+const DRAINING: Duration = Duration::from_secs(2);
 
 /// Works until dropped.
 pub async fn run(context: Arc<Context>) {
@@ -87,10 +91,10 @@ async fn look(context: &Context, key: &Key) -> Result<Option<Timestamp>, StoreEr
     })
     .await?;
     let Some(Upkeep { drain, look_again, .. }) = seen else { return Ok(None) };
-    if let Some(why) = drain {
-        drain_node(context, &key.name, &why).await?;
-    }
-    Ok(look_again)
+    let Some(why) = drain else { return Ok(look_again) };
+    drain_node(context, &key.name, &why).await?;
+    let soon = now.checked_add(DRAINING).unwrap_or(now);
+    Ok(look_again.into_iter().chain([soon]).min())
 }
 
 /// Puts our conditions into a node's status; says whether that changes it.

@@ -16,7 +16,9 @@ use super::failure::Failure;
 use super::path::Object;
 use super::{Answer, Call, body, registry};
 use crate::context::{Context, Live};
-use crate::{configs, depends, objects};
+use crate::objects::TASKS;
+use crate::store::Key;
+use crate::{configs, depends, objects, quota};
 
 pub(super) fn live(context: &Context) -> Result<&Live, Failure> {
     context.live().ok_or_else(|| Failure::unavailable("the scheduler is not running"))
@@ -97,7 +99,8 @@ pub(super) async fn plan(call: Call) -> Answer {
     let revision = context.store.revision();
     let (mut changes, mut demands) = (Vec::new(), Vec::new());
     for (i, object) in objects.iter().enumerate() {
-        let object = muster_api::kind::admit(object).map_err(|v| refused(i, v))?;
+        let object = with_defaults(&context, object);
+        let object = muster_api::kind::admit(&object).map_err(|v| refused(i, v))?;
         let change = change_of(&context, &object)?;
         if object["kind"] == "Task" && change["action"] == "create" {
             demands.push(demand(i, &object)?);
@@ -116,6 +119,21 @@ pub(super) async fn plan(call: Call) -> Answer {
     plan.waits.extend(held);
     let answer = describe(&names, &plan, changes, revision);
     Ok(super::json(StatusCode::OK, &answer))
+}
+
+/// A task that would be created, with what its namespace's quota fills in; anything else as it is.
+fn with_defaults(context: &Context, object: &Value) -> Value {
+    let mut object = object.clone();
+    let text = |pointer: &str| object.pointer(pointer).and_then(Value::as_str);
+    let namespace = text("/metadata/namespace").unwrap_or(DEFAULT).to_owned();
+    let key = Key::namespaced(TASKS, &*namespace, text("/metadata/name").unwrap_or_default());
+    if object["kind"] == "Task"
+        && context.store.get(&key).is_none()
+        && let Some(quota) = quota::of(&context.store, &namespace)
+    {
+        quota::fill_defaults(&quota.defaults, &mut object);
+    }
+    object
 }
 
 /// Tasks that would not be considered, with their reasons, and the others. ConfigMaps and Secrets that would be applied

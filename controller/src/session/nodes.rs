@@ -140,6 +140,7 @@ fn fill(context: &Context, speaker: &Speaker, report: &NodeReport, node: &mut No
     status.agent_version.clone_from(&speaker.version);
     status.address.clone_from(&report.address);
     status.battery = report.battery;
+    status.mission_locks.clone_from(&report.mission_locks);
     if let Some(pose) = &report.pose
         && status
             .pose

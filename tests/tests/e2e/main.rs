@@ -9,6 +9,7 @@ mod fence;
 mod figure4;
 mod frameworks;
 mod lease;
+mod missions;
 mod poses;
 mod preemption;
 mod probes;

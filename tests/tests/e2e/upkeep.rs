@@ -20,7 +20,7 @@ fn sleeper(placement: Value) -> Value {
 
 fn waits_for(taint: &'static str) -> impl Fn(&TaskStatus) -> bool {
     move |status| {
-        status.why.iter().any(|why| why.reason == "Tainted" && why.message.contains(taint))
+        status.why.iter().any(|why| why.reason == "OutOfService" && why.message.contains(taint))
     }
 }
 

@@ -11,18 +11,25 @@ impl Workload {
         context: Context,
         effects: &mut Vec<Effect>,
     ) {
-        let restarted = standing.restarted_since(&self.began_with).map(str::to_owned);
         self.standing = Some(standing);
         match self.state {
             State::Waiting { .. } => self.move_on(context, effects),
-            // Work is its executor's to begin again.
-            State::Launching | State::Running { .. } if !self.work => {
-                if let Some(task) = restarted {
-                    self.condemned = Some(Condemned::Dependency { task });
-                    self.end_if_wanted(context, effects);
-                }
+            State::Launching | State::Running { .. } => {
+                self.follow_others();
+                self.end_if_wanted(context, effects);
             }
+            // One that is being looked for follows when it is found to run.
             _ => {}
+        }
+    }
+
+    /// Condemns an attempt that began before a task that it follows was started again. Work is its executor's to begin
+    /// again.
+    pub(super) fn follow_others(&mut self) {
+        let standing = self.standing.as_ref().filter(|_| !self.work && self.condemned.is_none());
+        let task = standing.and_then(|standing| standing.restarted_since(&self.began_with));
+        if let Some(task) = task.map(str::to_owned) {
+            self.condemned = Some(Condemned::Dependency { task });
         }
     }
 

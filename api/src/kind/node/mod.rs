@@ -80,19 +80,28 @@ impl NodeSpec {
 pub const MISSION_LOCK: &str = "muster.dev/mission-lock";
 
 /// Why nothing is to be changed on a node now.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "camelCase")]
 pub struct MissionLock {
     /// The person or task that set it.
     pub holder: String,
     /// What they say about it; may be empty.
+    #[serde(default, skip_serializing_if = "String::is_empty")]
     pub reason: String,
 }
 
 impl Node {
-    /// The mission that the node is on. The one place where a lock is read: one that an agent sets by itself, without
-    /// the controller, would be seen here too.
+    /// The mission that the node is on, by the annotation or else by what its agent says. The one place where a lock is
+    /// read.
     #[must_use]
     pub fn mission_lock(&self) -> Option<MissionLock> {
+        let local = || self.status.as_ref()?.mission_locks.first().cloned();
+        self.annotated_lock().or_else(local)
+    }
+
+    /// The lock that is set through the controller.
+    #[must_use]
+    pub fn annotated_lock(&self) -> Option<MissionLock> {
         let text = self.metadata.annotations.as_ref()?.get(MISSION_LOCK)?;
         let (holder, reason) = text.split_once(':').unwrap_or((text, ""));
         Some(MissionLock { holder: holder.trim().to_owned(), reason: reason.trim().to_owned() })
@@ -148,6 +157,9 @@ pub struct NodeStatus {
     /// The charge of its battery; none: it has none, or does not tell.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub battery: Option<Battery>,
+    /// Mission locks that are set on the node itself, by its tasks or by people there.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub mission_locks: Vec<MissionLock>,
     /// Facts about the node; `Ready`, `Fenced`, `Battery` and `Maintenance` are the controller's, the others are the
     /// agent's.
     #[serde(skip_serializing_if = "Vec::is_empty")]

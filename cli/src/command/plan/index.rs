@@ -10,9 +10,11 @@ use serde_json::{Value, json};
 /// Letters of an index: 48 bits, against mistakes and not against malice.
 const LENGTH: usize = 12;
 
-/// The index of what the controller answered, with the changes that apply would make.
-pub(super) fn of(answer: &Value) -> String {
+/// The index of what the controller answered, with the changes that apply would make. `requests`: the objects and patches
+/// that apply would send, whole; what is printed of a Secret hides its values.
+pub(super) fn of(answer: &Value, requests: &[&Value]) -> String {
     let parts = json!([
+        requests,
         every(&answer["changes"], &["action", "kind", "namespace", "name", "fields"]),
         every(&answer["placements"], &["namespace", "name", "node", "leases"]),
         every(&answer["waits"], &["namespace", "name"]),
@@ -51,8 +53,11 @@ mod tests {
 
     #[test]
     fn only_what_would_be_done_counts() {
+        let of = |answer: &Value| super::of(answer, &[]);
         let index = of(&answer());
         assert_eq!(index.len(), LENGTH);
+        let (one, other) = (json!({"command": ["a"]}), json!({"command": ["b"]}));
+        assert_ne!(super::of(&answer(), &[&one]), super::of(&answer(), &[&other]));
         let same: [fn(&mut Value); 4] = [
             |a| a["revision"] = json!("8"),
             |a| a["placements"][0]["score"] = json!(1.6),

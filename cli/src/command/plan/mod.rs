@@ -149,7 +149,12 @@ async fn ask(
     let mut answer: Value = client.post_json(&uri, &json!({ "objects": objects })).await?;
     // The controller plans placements; which fields apply would change, only apply's own rules say.
     answer["changes"] = steps.iter().map(change).collect();
-    answer["index"] = index::of(&answer).into();
+    let requests = steps.iter().filter_map(|step| match &step.action {
+        Action::Create(object) => Some(object),
+        Action::Patch { patch, .. } => Some(patch),
+        Action::Nothing(_) => None,
+    });
+    answer["index"] = index::of(&answer, &requests.collect::<Vec<_>>()).into();
     let plan = serde_json::from_value(answer.clone()).map_err(|source| CliError::Answer {
         server: client.server.clone(),
         request: format!("POST {uri}"),
@@ -271,7 +276,7 @@ fn summary(plan: &Plan) -> String {
         text.push_str(&format!(" As of revision {}.", plan.revision));
     }
     text.push_str(&format!(
-        "\nIndex: {}; `muster apply --check-index` with it does this or nothing.\n",
+        "\nIndex: {}; `muster apply --check-index` with it refuses when it is no longer this.\n",
         plan.index
     ));
     text
@@ -346,7 +351,7 @@ mod tests {
             "+ task/a in default → r1, score 2.35, lease r1.body epoch 4\n\
              + task/b in default\n    would wait:\n    NODE   REFUSED BY   WHY\n    r1     LeaseHeld    held\n\
              \nPlan: 2 to create, 0 to change, 0 unchanged. 1 of 2 new tasks would be placed at once. As of revision 7.\n\
-             Index: INDEX; `muster apply --check-index` with it does this or nothing.\n"
+             Index: INDEX; `muster apply --check-index` with it refuses when it is no longer this.\n"
         );
         assert_eq!(fake.object("tasks/default/a"), None, "a plan stores nothing");
         fake.answer(PLAN, json!({"revision": "8"}));
@@ -362,7 +367,7 @@ mod tests {
             text,
             "~ task/a in default\n    spec.priority: 9 → 2\n\n\
              Plan: 0 to create, 1 to change, 1 unchanged. As of revision 8.\n\
-             Index: INDEX; `muster apply --check-index` with it does this or nothing.\n"
+             Index: INDEX; `muster apply --check-index` with it refuses when it is no longer this.\n"
         );
     }
 

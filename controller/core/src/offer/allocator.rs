@@ -134,9 +134,10 @@ pub fn holdings_refusal(member: &Member, wish: &Wish) -> Option<Refusal> {
     if !filter.selector.is_empty() && !filter.selector.matches(&facts.labels) {
         return Some(Refusal::SelectorMismatch { selector: filter.selector.to_string() });
     }
-    if let Some(taint) =
-        facts.taints.iter().chain(&facts.passing).find(|t| t.effect == TaintEffect::NoSchedule)
-    {
+    if let Some(taint) = facts.passing.first() {
+        return Some(Refusal::OutOfService { taint: taint.clone() });
+    }
+    if let Some(taint) = facts.taints.iter().find(|t| t.effect == TaintEffect::NoSchedule) {
         return Some(Refusal::Tainted { taint: taint.clone() });
     }
     if facts.unschedulable {

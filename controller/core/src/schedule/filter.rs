@@ -78,7 +78,7 @@ pub fn unsuited(name: &str, facts: &NodeFacts, spec: &TaskSpec) -> Option<Refusa
     identity(name, facts, spec)
         .or_else(joined)
         .or_else(|| functions(facts, &resources.sensors, &resources.actuators))
-        .or_else(|| tainted(&facts.taints, spec))
+        .or_else(|| tainted(facts, spec))
 }
 
 fn abilities(facts: &NodeFacts, spec: &TaskSpec) -> Option<Refusal> {
@@ -115,13 +115,16 @@ fn too_small(member: &Member, spec: &TaskSpec) -> Option<Refusal> {
     ready.then_some(Refusal::TooSmall { shortage })
 }
 
-fn tainted(taints: &[Taint], spec: &TaskSpec) -> Option<Refusal> {
+fn tainted(facts: &NodeFacts, spec: &TaskSpec) -> Option<Refusal> {
+    untolerated(&facts.taints, spec).map(|taint| Refusal::Tainted { taint })
+}
+
+fn untolerated(taints: &[Taint], spec: &TaskSpec) -> Option<Taint> {
     let keeps_away = |t: &&Taint| {
         t.effect == TaintEffect::NoSchedule
             && !spec.placement.tolerations.iter().any(|o| o.tolerates(t))
     };
-    let taint = taints.iter().find(keeps_away)?;
-    Some(Refusal::Tainted { taint: taint.clone() })
+    taints.iter().find(keeps_away).cloned()
 }
 
 /// The battery that the task itself asks for.
@@ -131,8 +134,11 @@ fn charge(facts: &NodeFacts, spec: &TaskSpec) -> Option<Refusal> {
 }
 
 fn admission(facts: &NodeFacts, spec: &TaskSpec) -> Option<Refusal> {
-    if let Some(refusal) = tainted(&facts.taints, spec).or_else(|| tainted(&facts.passing, spec)) {
+    if let Some(refusal) = tainted(facts, spec) {
         return Some(refusal);
+    }
+    if let Some(taint) = untolerated(&facts.passing, spec) {
+        return Some(Refusal::OutOfService { taint });
     }
     if facts.unschedulable {
         return Some(Refusal::Cordoned);

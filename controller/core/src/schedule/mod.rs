@@ -381,6 +381,7 @@ fn hardness(refusal: &Refusal) -> u8 {
         Refusal::NotReady { .. }
         | Refusal::Cordoned
         | Refusal::Tainted { .. }
+        | Refusal::OutOfService { .. }
         | Refusal::BatteryLow { .. } => 2,
         Refusal::TooSmall { .. } | Refusal::NoRuntime { .. } | Refusal::NoSpeed => 3,
         Refusal::NoSensor { .. } | Refusal::NoActuator { .. } | Refusal::OtherMap { .. } => 4,

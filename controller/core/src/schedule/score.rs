@@ -7,7 +7,8 @@ use muster_api::pose::OperationPosition;
 use crate::cluster::NodeFacts;
 
 /// The score of a node that passed the filters: metres for the cost `Distance` (Avalon, Alg. 1),
-/// seconds for `TravelTime` (straight line over speed), and what the task adds for each percent that the battery lacks. None: nothing to score by, because it is a
+/// seconds for `TravelTime` (straight line over speed); to either is added what the task asks for each
+/// percent that the battery lacks. None: nothing to score by, because it is a
 /// cloud node or the task has no operation position.
 #[must_use]
 pub fn score(facts: &NodeFacts, spec: &TaskSpec) -> Option<f64> {

@@ -8,7 +8,7 @@ use std::fmt;
 use std::time::Duration;
 
 use jiff::Timestamp;
-use muster_api::kind::task::{DEADLINE_EXCEEDED, PREEMPTED, PREEMPTING};
+use muster_api::kind::task::{DEADLINE_EXCEEDED, NODE_MAINTENANCE, PREEMPTED, PREEMPTING};
 use muster_api::phase::TaskPhase;
 
 use super::after;
@@ -100,8 +100,9 @@ impl fmt::Display for Fault {
 }
 
 /// Ends that say nothing about the template: somebody else brought them about.
-const NOT_ITS_FAULT: [&str; 9] = [
+const NOT_ITS_FAULT: [&str; 10] = [
     PREEMPTED,
+    NODE_MAINTENANCE,
     DEADLINE_EXCEEDED,
     "NodeFenced",
     "Disconnected",
@@ -156,7 +157,7 @@ pub fn due(task: &TaskView, node: Option<&NodeView>, deadline: Duration) -> Time
 /// Refusals because another task is there.
 const TAKEN: [&str; 4] = ["LeaseHeld", "Apart", "KeptForAnother", PREEMPTING];
 /// Refusals because the node takes nothing now.
-const SHUT: [&str; 2] = ["NotReady", "Cordoned"];
+const SHUT: [&str; 4] = ["NotReady", "Cordoned", "OutOfService", "BatteryLow"];
 
 /// It has no place and gets none before another task ends: it never had one, or another task was faster. One that was
 /// just created may be placed at once, and one whose node is away goes back there.
@@ -166,9 +167,13 @@ pub fn is_stranded(task: &TaskView) -> bool {
     task.phase == TaskPhase::Pending && (task.prefer.is_none() || taken)
 }
 
-/// It waits for something that its template has nothing to do with: a first place, or a node that was taken from it.
+/// It waits for something that its template has nothing to do with: a first place, a node that was taken from it, or a task
+/// that it depends on.
 #[must_use]
 pub fn is_excused(task: &TaskView) -> bool {
+    if task.phase == TaskPhase::Starting && task.reason == "AwaitingDependency" {
+        return true;
+    }
     let others = |r: &String| TAKEN.iter().chain(&SHUT).any(|word| r == word);
     let blamed = task.refusal.as_ref().is_some_and(|r| !others(r));
     task.phase == TaskPhase::Pending && !blamed

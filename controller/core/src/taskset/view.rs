@@ -149,8 +149,9 @@ impl NodeView {
             condition.and_then(|c| c.last_transition_time.as_ref()).map(|t| t.0)
         };
         let mut facts = NodeFacts::of(node);
-        // Where it is moves all the time, and no set asks for it.
-        facts.pose = None;
+        // Where it is and how full its battery is move all the time, and no set asks for them.
+        (facts.pose, facts.battery) = (None, None);
+        facts.passing.clear();
         NodeView {
             facts,
             lock: node.mission_lock(),

@@ -362,6 +362,8 @@ impl Scheduler {
                 } else {
                     self.cluster.unnominate(&uid);
                 }
+                // What the namespace asks for changes.
+                self.counter.changed();
                 let written_at = Instant::now();
                 self.waiting.insert(
                     uid,
@@ -416,6 +418,7 @@ impl Scheduler {
     }
 
     fn forget(&mut self, uid: &TaskUid) {
+        self.counter.changed();
         self.cluster.unnominate(uid);
         self.waiting.remove(uid);
         self.dirty.extend(self.cluster.release(uid));

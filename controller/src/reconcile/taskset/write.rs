@@ -107,21 +107,19 @@ struct Work<'a> {
     set: &'a TaskSet,
     /// Of new tasks, through their namespace's quota; kept until the commit.
     passes: Vec<Pass>,
-    /// New tasks that the quota keeps out for now, and why.
+    /// New tasks that cannot be created for now, and why: the quota, a ring of dependencies.
     kept_out: BTreeMap<String, String>,
 }
 
 impl Work<'_> {
     fn operations(&mut self, plan: &Plan) -> Result<Vec<Op>, Stop> {
         let mut ops = Vec::new();
-        let creates = |a: &Action| matches!(a, Action::Create(_) | Action::CreateRevision { .. });
-        if plan.actions.iter().any(creates) {
-            ops.extend(namespace_guard(self.context, TASKS, self.namespace())?);
-        }
+        let mut creates = false;
         for action in &plan.actions {
             match action {
                 Action::CreateRevision { name, number } => {
-                    ops.push(self.new_revision(name, *number)?)
+                    creates = true;
+                    ops.push(self.new_revision(name, *number)?);
                 }
                 Action::Renumber { name, number } => {
                     ops.push(self.revision(name, |revision| revision.spec.revision = *number)?);
@@ -137,9 +135,16 @@ impl Work<'_> {
                 Action::Release { task } => {
                     ops.push(self.task(task, |t| self.disown(&mut t.metadata))?);
                 }
-                Action::Create(new) => ops.extend(self.new_task(new, plan)?),
+                Action::Create(new) => {
+                    let made = self.new_task(new, plan)?;
+                    creates |= made.is_some();
+                    ops.extend(made);
+                }
                 Action::Delete { task, .. } => ops.extend(self.deletion(task)?),
             }
+        }
+        if creates {
+            ops.extend(namespace_guard(self.context, TASKS, self.namespace())?);
         }
         Ok(ops)
     }
@@ -209,7 +214,7 @@ impl Work<'_> {
         self.create(self.revision_key(name), &revision).map(|(op, _)| op)
     }
 
-    /// None: the namespace's quota has no room for it. What it has room for is made all the same.
+    /// None: it is refused. Those that are not are made all the same.
     fn new_task(&mut self, new: &NewTask, plan: &Plan) -> Result<Option<Op>, Stop> {
         let template = self.template(&new.revision, plan)?;
         let set = &*self.stored.key.name;
@@ -232,17 +237,16 @@ impl Work<'_> {
         if self.set.spec.spread && !self.set.spec.every_node {
             placement.apart.get_or_insert_with(|| set.to_owned());
         }
-        let (op, pass) = self.create(self.task_key(&new.name), &task)?;
-        match pass {
-            Ok(pass) => {
+        let refusal = match self.create(self.task_key(&new.name), &task) {
+            Ok((op, Ok(pass))) => {
                 self.passes.extend(pass);
-                Ok(Some(op))
+                return Ok(Some(op));
             }
-            Err(refusal) => {
-                self.kept_out.insert(new.name.clone(), refusal.message().to_owned());
-                Ok(None)
-            }
-        }
+            Ok((_, Err(refusal))) | Err(Stop::Refused(refusal)) => refusal,
+            Err(raced) => return Err(raced),
+        };
+        self.kept_out.insert(new.name.clone(), refusal.message().to_owned());
+        Ok(None)
     }
 
     /// That of the set itself, when the revision is the one that this plan keeps it as.
@@ -287,7 +291,10 @@ impl Work<'_> {
 
 /// Puts into Events what a plan did.
 fn tell(context: &Context, set: &TaskSet, plan: &Plan, kept_out: &BTreeMap<String, String>) {
-    for why in kept_out.values() {
+    // Once for as long as it is the same; which tasks they are, the next looks show.
+    let known = set.status.as_ref().and_then(|status| status.condition(REPLICA_FAILURE));
+    let news = kept_out.values().next().filter(|why| known.is_none_or(|c| c.message != **why));
+    if let Some(why) = news {
         context.events.warn_set(set, "FailedCreate", why.clone());
     }
     for action in &plan.actions {

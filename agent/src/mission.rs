@@ -1,0 +1,83 @@
+//! Mission locks that are set on the robot itself, with or without the controller: while there is one, no TaskSet ends a
+//! task there.
+//!
+//! | file | set by | counts |
+//! |---|---|---|
+//! | `$MUSTER_RUN_DIR/mission-lock` of a task | the task; a word or two about the mission, or nothing | until the file is removed or the task has ended |
+//! | `mission-lock` in the agent's data directory | a person on the robot, `HOLDER: REASON` | until the file is removed |
+//!
+//! They are looked at when the controller is told about the node: at once when it is back, before it can order anything.
+
+use std::fs::File;
+use std::io::Read as _;
+use std::path::Path;
+
+use muster_api::id::TaskUid;
+use muster_api::kind::node::MissionLock;
+
+use crate::checkpoint::Checkpoint;
+
+const FILE: &str = "mission-lock";
+/// More of a reason is not told.
+const LONGEST: u64 = 200;
+
+/// The locks that are set now: the person's first, then the tasks' in the order of their names.
+pub(crate) fn locks(
+    data_dir: &Path,
+    checkpoint: &Checkpoint,
+    live: impl IntoIterator<Item = (TaskUid, String)>,
+) -> Vec<MissionLock> {
+    let person = read(&data_dir.join(FILE)).map(|text| {
+        let (holder, reason) = text.split_once(':').unwrap_or(("somebody on the robot", &text));
+        MissionLock { holder: holder.trim().to_owned(), reason: reason.trim().to_owned() }
+    });
+    let of_task = |(uid, title): (TaskUid, String)| {
+        let reason = read(&checkpoint.task_dir(&uid).join("run").join(FILE))?;
+        Some(MissionLock { holder: format!("task {title}"), reason })
+    };
+    let mut tasks: Vec<MissionLock> = live.into_iter().filter_map(of_task).collect();
+    tasks.sort_by(|a, b| a.holder.cmp(&b.holder));
+    person.into_iter().chain(tasks).collect()
+}
+
+/// The first line of a file, as far as it is told. A task's file is the task's to fill: it is a regular file or it does not
+/// count, so that a look never waits.
+fn read(path: &Path) -> Option<String> {
+    let named = std::fs::symlink_metadata(path).ok()?;
+    if !named.is_file() {
+        return None;
+    }
+    let mut bytes = Vec::new();
+    // Set is set, also when it cannot be read.
+    if let Ok(file) = File::open(path) {
+        let _ = file.take(LONGEST).read_to_end(&mut bytes);
+    }
+    let text = String::from_utf8_lossy(&bytes);
+    let line = text.lines().next().unwrap_or_default();
+    let shown = line.chars().filter(|c| !c.is_control());
+    Some(shown.collect::<String>().trim().to_owned())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_file_is_a_lock_and_nothing_else_is() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join(FILE);
+        assert_eq!(read(&path), None);
+        std::fs::write(&path, "carries a\u{7} tray\nto the kitchen\n").unwrap();
+        assert_eq!(read(&path).as_deref(), Some("carries a tray"));
+        std::fs::write(&path, "").unwrap();
+        assert_eq!(read(&path).as_deref(), Some(""));
+        std::fs::write(&path, vec![b'x'; 10_000]).unwrap();
+        assert_eq!(read(&path).map(|text| text.len()), Some(200));
+        std::fs::remove_file(&path).unwrap();
+        std::os::unix::fs::symlink("/etc/passwd", &path).unwrap();
+        assert_eq!(read(&path), None);
+        std::fs::remove_file(&path).unwrap();
+        std::fs::create_dir(&path).unwrap();
+        assert_eq!(read(&path), None);
+    }
+}
