@@ -68,36 +68,29 @@ impl FromStr for MilliCpu {
 
     fn from_str(text: &str) -> Result<Self, QuantityError> {
         const WHAT: &str = "a quantity of cpu";
-        let bad = || QuantityError::new(text, WHAT, suggest_cpu(text));
-        let trimmed = text.trim();
-        let (digits, per_core) = match trimmed.strip_suffix('m') {
-            Some(millis) => (millis, 1),
-            None => (trimmed, 1000),
+        let (number, suffix) = split_suffix(text.trim());
+        let per_unit = match suffix {
+            "" => Some(1000),
+            "m" => Some(1),
+            _ => None,
         };
-        let value = decimal(digits).ok_or_else(bad)?;
-        // Rounded up as Kubernetes does: a task never gets less than it asked for.
-        let millis = (value * f64::from(per_core)).ceil();
-        if millis <= 1e12 { Ok(MilliCpu(millis as u64)) } else { Err(bad()) }
+        let millis = per_unit.and_then(|unit| amount(number, unit));
+        let millis = millis.filter(|millis| *millis <= MOST_MILLIS);
+        millis.map(MilliCpu).ok_or_else(|| QuantityError::new(text, WHAT, suggest_cpu(text)))
     }
 }
+
+/// More cores than there are; sums of such amounts do not overflow.
+const MOST_MILLIS: u64 = 1_000_000_000_000;
 
 impl FromStr for Bytes {
     type Err = QuantityError;
 
     fn from_str(text: &str) -> Result<Self, QuantityError> {
         const WHAT: &str = "a quantity of bytes";
-        let bad = || QuantityError::new(text, WHAT, suggest_bytes(text));
-        let trimmed = text.trim();
-        let split =
-            trimmed.find(|c: char| c.is_ascii_alphabetic() && c != 'e').unwrap_or(trimmed.len());
-        let (digits, suffix) = trimmed.split_at(split);
-        let unit = byte_unit(suffix).ok_or_else(bad)?;
-        let unsigned = digits.starts_with(|c: char| c.is_ascii_digit());
-        if let Some(whole) = unsigned.then(|| digits.parse::<u64>().ok()).flatten() {
-            return whole.checked_mul(unit).map(Bytes).ok_or_else(bad);
-        }
-        let bytes = (decimal(digits).ok_or_else(bad)? * unit as f64).ceil();
-        if bytes < 9.2e18 { Ok(Bytes(bytes as u64)) } else { Err(bad()) }
+        let (number, suffix) = split_suffix(text.trim());
+        let bytes = byte_unit(suffix).and_then(|unit| amount(number, unit));
+        bytes.map(Bytes).ok_or_else(|| QuantityError::new(text, WHAT, suggest_bytes(text)))
     }
 }
 
@@ -109,34 +102,74 @@ fn byte_unit(suffix: &str) -> Option<u64> {
         "G" => 1_000_000_000,
         "T" => 1_000_000_000_000,
         "P" => 1_000_000_000_000_000,
+        "E" => 1_000_000_000_000_000_000,
         "Ki" => 1 << 10,
         "Mi" => 1 << 20,
         "Gi" => 1 << 30,
         "Ti" => 1 << 40,
         "Pi" => 1 << 50,
+        "Ei" => 1 << 60,
         _ => return None,
     })
 }
 
-/// A finite number ≥ 0 in plain or exponent notation. No sign, no `inf`, no `nan`.
-fn decimal(text: &str) -> Option<f64> {
-    let plain = !text.is_empty()
-        && text.starts_with(|c: char| c.is_ascii_digit() || c == '.')
-        && text.chars().all(|c| c.is_ascii_digit() || matches!(c, '.' | 'e' | '+' | '-'));
-    let value: f64 = plain.then(|| text.parse().ok())??;
-    value.is_finite().then_some(value)
+/// The number and the letters behind it. An exponent belongs to the number and has no letters behind it: `1E` is an
+/// exabyte, `1E3` a thousand.
+fn split_suffix(text: &str) -> (&str, &str) {
+    let letters = text.find(|c: char| c.is_ascii_alphabetic()).unwrap_or(text.len());
+    let (number, suffix) = text.split_at(letters);
+    let exponent = suffix.strip_prefix(['e', 'E']).unwrap_or_default();
+    if exponent.starts_with(|c: char| c.is_ascii_digit() || c == '+' || c == '-') {
+        return (text, "");
+    }
+    (number, suffix)
+}
+
+/// As many digits of a number are looked at, which is more than an amount can have; what follows counts as one more of
+/// the last. The product with any unit fits 128 bits.
+const DIGITS: usize = 19;
+
+/// A number ≥ 0 without a sign, `12`, `.5`, `1.5e3`, times `unit`. Exact, and rounded up as Kubernetes does: a task never
+/// gets less than it asked for. None: not a number, or too much.
+fn amount(number: &str, unit: u64) -> Option<u64> {
+    let (number, exponent) = match number.split_once(['e', 'E']) {
+        Some((number, exponent)) => (number, exponent.parse::<i32>().ok()?),
+        None => (number, 0),
+    };
+    let (whole, fraction) = number.split_once('.').unwrap_or((number, ""));
+    let digits = format!("{whole}{fraction}");
+    if digits.is_empty() || !digits.bytes().all(|b| b.is_ascii_digit()) {
+        return None;
+    }
+    let digits = digits.trim_start_matches('0');
+    let (looked_at, rest) = digits.split_at(digits.len().min(DIGITS));
+    if looked_at.is_empty() {
+        return Some(0);
+    }
+    let more = u128::from(rest.bytes().any(|b| b != b'0'));
+    let product = (looked_at.parse::<u128>().ok()? + more) * u128::from(unit);
+    let places = i64::try_from(rest.len()).ok()? - i64::try_from(fraction.len()).ok()?;
+    let places = i64::from(exponent).checked_add(places)?;
+    let power = |places: i64| 10_u128.checked_pow(u32::try_from(places).ok()?);
+    let scaled = if places >= 0 {
+        product.checked_mul(power(places)?)?
+    } else {
+        // What is divided by more than 128 bits hold is less than one of the smallest.
+        power(-places).map_or(1, |divisor| product.div_ceil(divisor))
+    };
+    u64::try_from(scaled).ok()
 }
 
 fn leading_number(text: &str) -> Option<&str> {
     let text = text.trim();
     let end = text.find(|c: char| !c.is_ascii_digit() && c != '.').unwrap_or(text.len());
     let number = &text[..end];
-    decimal(number).map(|_| number)
+    amount(number, 1).map(|_| number)
 }
 
 fn suggest_cpu(text: &str) -> String {
-    match leading_number(text).and_then(|n| n.parse::<f64>().ok().map(|v| (n, v))) {
-        Some((n, v)) if v < 1e6 => format!("try {n:?} or \"{}m\"", (v * 1000.0).ceil() as u64),
+    match leading_number(text).and_then(|n| Some((n, amount(n, 1000)?))) {
+        Some((n, millis)) if millis < 1_000_000_000 => format!("try {n:?} or \"{millis}m\""),
         _ => "try \"2\" or \"500m\"".to_owned(),
     }
 }
@@ -270,6 +303,11 @@ mod tests {
             ("0.0001", 1),
             ("1e1", 10_000),
             ("0", 0),
+            // In binary floating point a little more than 16 100, which would be rounded up.
+            ("16.1", 16_100),
+            ("0.10000000000000000000000001", 101),
+            ("1e-400", 1),
+            ("0e400", 0),
         ] {
             assert_eq!(text.parse(), Ok(MilliCpu(millis)), "{text}");
         }
@@ -284,6 +322,9 @@ mod tests {
             ("1.5Gi", 1_610_612_736),
             ("10M", 10_000_000),
             ("1e3", 1000),
+            ("1E3", 1000),
+            ("1E", 1_000_000_000_000_000_000),
+            ("9007199254740993", 9_007_199_254_740_993),
         ] {
             assert_eq!(text.parse(), Ok(Bytes(bytes)), "{text}");
         }
@@ -306,7 +347,19 @@ mod tests {
             let error = text.parse::<Bytes>().expect_err(text);
             assert_eq!(error.suggestion(), suggestion, "{text}");
         }
-        for text in ["inf", "nan", "1e400", "99999999999P", "1 2", "+1"] {
+        for text in [
+            "inf",
+            "nan",
+            "1e400",
+            "99999999999P",
+            "1 2",
+            "+1",
+            "1e3m",
+            "1e3Ki",
+            "1e",
+            ".",
+            "1.2.3",
+        ] {
             assert!(text.parse::<MilliCpu>().is_err() && text.parse::<Bytes>().is_err(), "{text}");
         }
     }

@@ -8,7 +8,8 @@ use std::fmt;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use crate::validate::Violations;
+use crate::name::check_name;
+use crate::validate::{Violations, member_path};
 
 /// The labels of an object.
 pub type Labels = BTreeMap<String, String>;
@@ -86,18 +87,30 @@ impl LabelSelector {
     /// Names the part that cannot be read.
     pub fn parse(text: &str) -> Result<Self, SelectorError> {
         let mut selector = LabelSelector::default();
+        if text.trim().is_empty() {
+            return Ok(selector);
+        }
+        // An empty part is a mistake: `app=$APP,$MORE` without a MORE would select more than was meant.
         for part in split_outside_parentheses(text) {
-            let part = part.trim();
-            if !part.is_empty() {
-                selector.match_expressions.push(parse_requirement(part)?);
-            }
+            selector.match_expressions.push(parse_requirement(part.trim())?);
         }
         Ok(selector)
     }
 
     /// Adds what is wrong with this selector below `path`.
     pub fn validate(&self, path: &str, violations: &mut Violations) {
+        check_labels(&self.match_labels, &format!("{path}.matchLabels"), violations);
         for (i, requirement) in self.match_expressions.iter().enumerate() {
+            if !is_label_key(&requirement.key) {
+                let path = format!("{path}.matchExpressions[{i}].key");
+                violations.invalid(path, not_a_key(&requirement.key));
+            }
+            for (n, value) in requirement.values.iter().enumerate() {
+                if !is_label_value(value) {
+                    let path = format!("{path}.matchExpressions[{i}].values[{n}]");
+                    violations.invalid(path, not_a_value(value));
+                }
+            }
             let needs_values =
                 matches!(requirement.operator, LabelOperator::In | LabelOperator::NotIn);
             if needs_values == requirement.values.is_empty() {
@@ -151,14 +164,49 @@ fn split_outside_parentheses(text: &str) -> Vec<&str> {
     parts
 }
 
+/// Adds what is wrong with the labels of an object at `path` (Kubernetes' rules).
+pub fn check_labels(labels: &Labels, path: &str, violations: &mut Violations) {
+    for (key, value) in labels {
+        if !is_label_key(key) {
+            violations.invalid(member_path(path, key), not_a_key(key));
+        }
+        if !is_label_value(value) {
+            violations.invalid(member_path(path, key), not_a_value(value));
+        }
+    }
+}
+
+const NAME: &str =
+    "at most 63 letters, digits, '-', '_' and '.', beginning and ending with a letter or digit";
+
+fn not_a_key(key: &str) -> String {
+    format!(
+        "{key:?} is not a label's key: {NAME}, perhaps after a domain and a slash, example.dev/name"
+    )
+}
+
+fn not_a_value(value: &str) -> String {
+    format!("{value:?} is not a label's value: {NAME}")
+}
+
+/// A name, or a DNS subdomain, `/` and a name.
 fn is_label_key(key: &str) -> bool {
-    !key.is_empty()
-        && key.len() <= 317
-        && key.chars().all(|c| c.is_ascii_alphanumeric() || "-_./".contains(c))
+    let (prefix, name) = match key.split_once('/') {
+        Some((prefix, name)) => (Some(prefix), name),
+        None => (None, key),
+    };
+    let is_subdomain =
+        |text: &str| text.len() <= 253 && text.split('.').all(|part| check_name(part).is_ok());
+    !name.is_empty() && is_label_value(name) && prefix.is_none_or(is_subdomain)
 }
 
 fn is_label_value(value: &str) -> bool {
-    value.len() <= 63 && value.chars().all(|c| c.is_ascii_alphanumeric() || "-_.".contains(c))
+    let outer = |c: char| c.is_ascii_alphanumeric();
+    value.is_empty()
+        || (value.len() <= 63
+            && value.starts_with(outer)
+            && value.ends_with(outer)
+            && value.chars().all(|c| outer(c) || "-_.".contains(c)))
 }
 
 fn parse_requirement(part: &str) -> Result<LabelRequirement, SelectorError> {

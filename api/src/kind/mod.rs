@@ -25,6 +25,7 @@ use serde::de::DeserializeOwned;
 use serde_json::Value;
 
 use crate::name::check_name;
+use crate::selector::{Labels, check_labels};
 use crate::validate::{Violations, did_you_mean, member_path};
 
 /// What everybody needs to know of a kind.
@@ -197,6 +198,9 @@ fn check_metadata(info: &KindInfo, object: &Value, violations: &mut Violations) 
             violations.required("metadata.name");
         }
     }
+    let labels = metadata.get("labels").cloned().unwrap_or_default();
+    let labels = serde_json::from_value::<Option<Labels>>(labels).ok().flatten();
+    check_labels(&labels.unwrap_or_default(), "metadata.labels", violations);
     match text("namespace") {
         Some(_) if !info.namespaced => {
             violations

@@ -21,6 +21,8 @@
 //! | [`quota`] | whether a namespace's quota lets a new task in |
 //! | [`hold`] | why a task is not considered for a place at all |
 //! | [`config`] | what a task gets of ConfigMaps and Secrets |
+//! | [`deadline`] | when a task has been on its node, or has been over, for long enough |
+//! | [`deletion`] | when an object is to be gone that somebody deletes |
 //! | [`recent`] | one allocation for what many nodes or tasks have in common |
 //! | [`node_health`] | when a node counts as lost |
 //! | [`taskset`] | which tasks of a TaskSet begin, end and follow each other |
@@ -31,6 +33,8 @@
 
 pub mod cluster;
 pub mod config;
+pub mod deadline;
+pub mod deletion;
 pub mod fairness;
 #[cfg(test)]
 mod fixtures;

@@ -7,54 +7,16 @@
 use std::collections::{BTreeSet, HashMap};
 use std::sync::Arc;
 
-use jiff::{SignedDuration, Timestamp};
+use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::MicroTime;
 use muster_api::kind::task::{DEADLINE_EXCEEDED, StopOrder, Task};
+use muster_controller_core::deadline::{Due, due};
 
 use super::{again, next_events, watch_from_now};
 use crate::context::Context;
 use crate::objects::{self, TASKS};
 use crate::rest::delete;
 use crate::store::{Change, Key, StoreError, Stored};
-
-/// What becomes of a task when its time has come.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Due {
-    /// It has been on its node long enough.
-    Stop(Timestamp),
-    /// It ended long ago.
-    Remove(Timestamp),
-}
-
-impl Due {
-    fn at(self) -> Timestamp {
-        match self {
-            Due::Stop(at) | Due::Remove(at) => at,
-        }
-    }
-}
-
-/// What waits for a task, and when; none: nothing.
-fn due(task: &Task) -> Option<Due> {
-    let status = task.status.as_ref()?;
-    let after = |from: &Option<MicroTime>, seconds: u32| {
-        from.as_ref()?.0.checked_add(SignedDuration::from_secs(i64::from(seconds))).ok()
-    };
-    if task.metadata.deletion_timestamp.is_some() {
-        return None;
-    }
-    if status.phase.is_terminal() {
-        // Its end is told by the node's clock, which may be wrong: it was not before its placement. One that was fenced
-        // before it started has no end of its own.
-        let bound = status.bound_at.clone();
-        let ended = status.finished_at.clone().into_iter().chain(bound).max_by_key(|t| t.0);
-        return after(&ended, task.spec.ttl_seconds_after_finished?).map(Due::Remove);
-    }
-    if !status.phase.holds_node() || status.stop.is_some() {
-        return None;
-    }
-    after(&status.bound_at, task.spec.active_deadline_seconds?).map(Due::Stop)
-}
 
 /// When to look at which task.
 #[derive(Debug, Default)]
@@ -154,50 +116,10 @@ async fn act(context: &Context, key: &Key, now: Timestamp) -> Result<(), StoreEr
 
 #[cfg(test)]
 mod tests {
-    use serde_json::{Value, json};
-
     use super::*;
-
-    fn task(spec: Value, status: Value) -> Task {
-        let mut object = json!({
-            "apiVersion": muster_api::API_VERSION, "kind": "Task", "metadata": {"name": "t"},
-            "spec": {"run": {"process": {"command": ["a"]}}}, "status": status,
-        });
-        for (key, value) in spec.as_object().expect("members") {
-            object["spec"][key] = value.clone();
-        }
-        serde_json::from_value(object).expect("a task")
-    }
 
     fn at(text: &str) -> Timestamp {
         text.parse().expect("a time")
-    }
-
-    /// Kubernetes' rules for `activeDeadlineSeconds` of a Pod and `ttlSecondsAfterFinished` of a Job.
-    #[test]
-    fn each_task_waits_for_what_its_spec_and_phase_say() {
-        let (bound, ended) = ("2026-01-01T00:00:00.000000Z", "2026-01-01T00:01:00.000000Z");
-        let deadline = json!({"activeDeadlineSeconds": 30, "ttlSecondsAfterFinished": 5});
-        let running = json!({"phase": "Running", "boundAt": bound});
-        let over = json!({"phase": "Failed", "boundAt": bound, "finishedAt": ended});
-        let stopped = json!({"phase": "Running", "boundAt": bound, "stop": {"reason": "Preempted", "message": "", "at": ended}});
-        let table = [
-            (json!({}), running.clone(), None),
-            (deadline.clone(), json!({"phase": "Pending"}), None),
-            (deadline.clone(), running.clone(), Some(Due::Stop(at("2026-01-01T00:00:30Z")))),
-            (deadline.clone(), stopped, None),
-            (deadline, over.clone(), Some(Due::Remove(at("2026-01-01T00:01:05Z")))),
-            (json!({"activeDeadlineSeconds": 30}), over, None),
-            (json!({"ttlSecondsAfterFinished": 0}), running, None),
-            (
-                json!({"ttlSecondsAfterFinished": 0}),
-                json!({"phase": "Failed", "boundAt": bound}),
-                Some(Due::Remove(at(bound))),
-            ),
-        ];
-        for (spec, status, expected) in table {
-            assert_eq!(due(&task(spec.clone(), status.clone())), expected, "{spec} {status}");
-        }
     }
 
     #[test]

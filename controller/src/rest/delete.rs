@@ -9,9 +9,11 @@ use std::sync::Arc;
 
 use axum::response::Response;
 use http::StatusCode;
-use jiff::{SignedDuration, Timestamp};
+use jiff::Timestamp;
+use muster_api::kind::task::DEFAULT_GRACE_SECONDS;
 use muster_api::name::NodeName;
 use muster_api::phase::TaskPhase;
+use muster_controller_core::deletion::{Deletion, deletion};
 use serde::Deserialize;
 use serde_json::{Value, json};
 
@@ -22,9 +24,6 @@ use super::{Answer, Call, body, failure::Failure, metadata};
 use crate::context::Context;
 use crate::objects;
 use crate::store::{Key, Op, Precondition, Resource, Store, StoreError, Stored};
-
-/// What a task gets that says nothing about it, s.
-const DEFAULT_GRACE: i64 = 10;
 
 /// `DeleteOptions`.
 #[derive(Debug, Clone, Default, Deserialize)]
@@ -281,20 +280,19 @@ fn check(entry: &Entry, present: &Stored, preconditions: &Preconditions) -> Resu
     Ok(())
 }
 
-/// The object with the wish that it goes. Asked again, the end can come sooner, not later.
+/// The object with the wish that it goes.
 fn wish(now: Timestamp, object: &Value, options: &Options, finalizer: Option<&str>) -> Value {
     let mut object = object.clone();
-    let own = &object["spec"]["gracePeriodSeconds"];
-    let grace = options.grace_period_seconds.or_else(|| own.as_i64()).unwrap_or(DEFAULT_GRACE);
-    let grace = if object["kind"] == "Task" { grace } else { 0 };
-    let at = now.saturating_add(SignedDuration::from_secs(grace)).unwrap_or(Timestamp::MAX);
+    let (asked, own) = if object["kind"] == "Task" {
+        let own = object["spec"]["gracePeriodSeconds"].as_i64();
+        (options.grace_period_seconds, own.unwrap_or_else(|| DEFAULT_GRACE_SECONDS.into()))
+    } else {
+        // Nothing of it runs.
+        (options.grace_period_seconds.map(|_| 0), 0)
+    };
     let present = object["metadata"]["deletionTimestamp"].as_str();
     let present = present.and_then(|text| text.parse::<Timestamp>().ok());
-    let sooner = match present {
-        None => true,
-        Some(present) => options.grace_period_seconds.is_some() && at < present,
-    };
-    if sooner {
+    if let Some(Deletion { at, grace }) = deletion(now, asked, own, present) {
         let text = at.strftime("%Y-%m-%dT%H:%M:%SZ").to_string();
         object["metadata"]["deletionTimestamp"] = text.into();
         object["metadata"]["deletionGracePeriodSeconds"] = grace.into();

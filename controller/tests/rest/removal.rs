@@ -41,6 +41,9 @@ async fn a_task_without_a_node_goes_at_once_and_another_waits() {
     let status = json!({"status": {"phase": "Running", "node": "n1"}});
     let (code, answer) = send(&admin, "PATCH", &format!("{path}/status"), status).await;
     assert_eq!(code, 200, "{answer}");
+    // Kubernetes takes a negative one for a second.
+    let negative = delete(&admin, &path, json!({"gracePeriodSeconds": -1})).await;
+    assert_eq!(refusal(&negative), (400, "BadRequest"));
     let (code, ending) = delete(&admin, &path, Value::Null).await;
     assert_eq!((code, ending["kind"].as_str()), (200, Some("Task")));
     assert_eq!(ending["metadata"]["deletionGracePeriodSeconds"], 10);

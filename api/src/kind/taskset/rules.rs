@@ -5,6 +5,7 @@ use serde_json::Value;
 use super::{MAX_SET_NAME_LEN, REVISION_LABEL, SET_LABEL, TaskSetSpec, UnreachablePolicy};
 use crate::kind::admit_spec;
 use crate::kind::task::{RestartPolicy, rules as task_rules};
+use crate::selector::check_labels;
 use crate::validate::{Violations, member_path};
 
 pub(super) fn admit_body(object: &mut Value, violations: &mut Violations) {
@@ -103,6 +104,7 @@ fn template_rules(spec: &TaskSetSpec, violations: &mut Violations) {
             .forbidden("spec.template.spec.placement.prefer", "is set by the rollout")
             .suggest("leave it out");
     }
+    check_labels(&spec.template.metadata.labels, "spec.template.metadata.labels", violations);
     for own in [SET_LABEL, REVISION_LABEL] {
         if spec.template.metadata.labels.contains_key(own) {
             let path = member_path("spec.template.metadata.labels", own);
