@@ -162,7 +162,9 @@ impl Session {
             outbound,
             logs: Arc::clone(&logs),
             replaced: replaced.clone(),
+            written: Arc::default(),
         };
+        let hello_written = Arc::clone(&connection.written);
         let sessions = Arc::clone(&self.sessions);
         let beginning = sessions.begin().await;
         // First of all: one that is not admitted must not end the session of one that is.
@@ -172,6 +174,7 @@ impl Session {
         // at this again, and must not overwrite the newer word with the older one.
         self.sessions.heard(&self.node);
         self.write_hello(&speaker, &hello).await?;
+        hello_written.store(true, Ordering::Release);
         drop(beginning);
         self.send(ToAgent::Welcome(welcome())).await?;
         let wake = self.send_page(&hello.tasks).await?;

@@ -28,6 +28,7 @@ pub mod reports;
 mod strays;
 
 use std::collections::HashMap;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
@@ -68,6 +69,8 @@ pub(crate) struct Connection {
     pub(crate) logs: Arc<logs::Readers>,
     /// Ends this session: a later one of the same node has begun.
     pub(crate) replaced: tokio_util::sync::CancellationToken,
+    /// What it said first is in the store.
+    pub(crate) written: Arc<AtomicBool>,
 }
 
 /// Every session.
@@ -176,6 +179,11 @@ impl Sessions {
     }
 
     /// Takes a session in; an earlier one of the same node ends.
+    /// Whether what the agent said first in its present session is in the store.
+    pub(crate) fn is_known(&self, node: &NodeName) -> bool {
+        self.connection(node).is_some_and(|connection| connection.written.load(Ordering::Acquire))
+    }
+
     pub(crate) fn connect(&self, node: &NodeName, connection: Connection) {
         if let Some(earlier) = lock(&self.connections).insert(node.clone(), connection) {
             earlier.replaced.cancel();

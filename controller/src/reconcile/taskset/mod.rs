@@ -34,6 +34,9 @@ use write::Outcome;
 /// When a look could not be carried out because something else refused it (a namespace that ends).
 const LATER: Duration = Duration::from_secs(5);
 
+/// When a node is expected to be heard: agents are back within seconds of a controller's start.
+const SOON: Duration = Duration::from_millis(500);
+
 /// Works until dropped.
 pub async fn run(context: Arc<Context>) {
     again(&context, "task sets are not looked after", follow).await;
@@ -141,6 +144,7 @@ async fn look(context: &Context, index: &Index, key: &Key) -> Result<Next, Store
     Ok(match write::carry_out(context, &stored, &set, &plan).await? {
         Outcome::Done => plan.look_again.map_or(Next::Nothing, Next::At),
         Outcome::Raced => Next::Again,
+        Outcome::Away => Next::At(now.checked_add(SOON).unwrap_or(now)),
         Outcome::Refused(why) => {
             tracing::warn!(set = %key, why, "a task set cannot go on yet");
             Next::At(now.checked_add(LATER).unwrap_or(now))

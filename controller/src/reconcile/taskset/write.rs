@@ -10,6 +10,7 @@ use muster_api::kind::node::Node;
 use muster_api::kind::task::Task;
 use muster_api::kind::taskset::{CHANGE_CAUSE, SET_LABEL, TaskSet, TaskSetStatus, TaskTemplate};
 use muster_api::kind::taskset_revision::{TaskSetRevision, TaskSetRevisionSpec};
+use muster_api::name::NodeName;
 use muster_controller_core::taskset::{Action, NewTask, News, Place, Plan};
 
 use crate::context::Context;
@@ -26,6 +27,8 @@ pub(super) enum Outcome {
     Done,
     /// Something that it relied on is not so any more.
     Raced,
+    /// A node was not heard since this controller began: it may be on a mission that nobody here knows of.
+    Away,
     /// Something else does not let it pass.
     Refused(String),
 }
@@ -33,6 +36,7 @@ pub(super) enum Outcome {
 /// Why a plan has no operations.
 enum Stop {
     Raced,
+    Away,
     Refused(Failure),
 }
 
@@ -52,6 +56,7 @@ pub(super) async fn carry_out(
     let more = match work.operations(plan) {
         Ok(more) => more,
         Err(Stop::Raced) => return Ok(Outcome::Raced),
+        Err(Stop::Away) => return Ok(Outcome::Away),
         Err(Stop::Refused(failure)) => return Ok(Outcome::Refused(failure.message().to_owned())),
     };
     let refused = work.kept_out.values().next().cloned();
@@ -147,6 +152,13 @@ impl Work<'_> {
             ops.extend(namespace_guard(self.context, TASKS, self.namespace())?);
         }
         Ok(ops)
+    }
+
+    fn is_known(&self, node: &str) -> bool {
+        let (Some(live), Ok(node)) = (self.context.live(), NodeName::new(node)) else {
+            return true;
+        };
+        live.sessions.is_known(&node)
     }
 
     fn namespace(&self) -> &str {
@@ -278,9 +290,15 @@ impl Work<'_> {
         let status = task.status.unwrap_or_default();
         let node = status.node.filter(|_| !status.phase.is_terminal());
         if let Some(node) = node.and_then(|n| self.context.store.get(&objects::node_key(&n))) {
-            let locked = objects::read::<Node>(&node).is_some_and(|n| n.mission_lock().is_some());
-            if locked {
+            let Some(object) = objects::read::<Node>(&node) else { return Err(Stop::Raced) };
+            if object.mission_lock().is_some() {
                 return Err(Stop::Raced);
+            }
+            // One that is silent for longer is not ready; what it says then is heard before its tasks end.
+            if object.status.is_some_and(|status| status.is_ready())
+                && !self.is_known(&node.key.name)
+            {
+                return Err(Stop::Away);
             }
             let precondition = Precondition::revision(node.revision);
             ops.push(Op::Check { key: node.key.clone(), precondition });
