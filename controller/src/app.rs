@@ -110,7 +110,6 @@ pub async fn run(
     config: Config,
     shutdown: impl Future<Output = ()> + Send,
 ) -> Result<(), AppError> {
-    crate::memory::keep_buffers();
     let running = start(config).await?;
     let address = running.address();
     tracing::info!(%address, url = running.context.url(), "serving");

@@ -14,7 +14,7 @@
 //! | [`events`], [`objects`] | Event objects; typed reading and writing of the kinds |
 //! | `quota` | the door of namespaces with a Quota |
 //! | `serve` | the TLS port |
-//! | `kubeconfig`, `metrics`, `memory` | the admin's credential file; the Prometheus recorder; what the allocator keeps |
+//! | `kubeconfig`, `metrics` | the admin's credential file; the Prometheus recorder |
 
 pub mod app;
 pub mod auth;
@@ -24,7 +24,6 @@ pub mod context;
 mod depends;
 pub mod events;
 pub mod kubeconfig;
-mod memory;
 mod metrics;
 pub mod objects;
 pub mod pki;
