@@ -5,9 +5,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
-use muster_api::condition::{
-    Condition, ConditionStatus, DISK_PRESSURE, LOCALIZED, QUOTAS_ENFORCED,
-};
+use muster_api::condition::{Condition, DISK_PRESSURE, LOCALIZED, QUOTAS_ENFORCED};
 use muster_api::kind::node::RuntimeStatus;
 use muster_api::pose::Pose;
 use muster_api::wire::agent::v1 as proto;
@@ -125,8 +123,8 @@ impl Node {
         ];
         let mut conditions = self.fixed.conditions.clone();
         conditions.push(match self.disk.pressure() {
-            Some(why) => condition(DISK_PRESSURE, true, "DiskNearlyFull", why),
-            None => condition(DISK_PRESSURE, false, "EnoughSpace", String::new()),
+            Some(why) => Condition::new(DISK_PRESSURE, true, "DiskNearlyFull", why),
+            None => Condition::new(DISK_PRESSURE, false, "EnoughSpace", String::new()),
         });
         if let Some(position) = &self.position {
             let pose = position.current();
@@ -135,7 +133,7 @@ impl Node {
                 Some(false) => (false, "Lost"),
                 None => (false, "NoPose"),
             };
-            conditions.push(condition(LOCALIZED, localized, reason, String::new()));
+            conditions.push(Condition::new(LOCALIZED, localized, reason, String::new()));
         }
         let battery = self.battery.as_ref().and_then(BatteryGauge::charge);
         let mission_locks =
@@ -185,21 +183,11 @@ fn labels(config: &Config) -> BTreeMap<String, String> {
     labels
 }
 
-fn condition(r#type: &str, holds: bool, reason: &str, message: String) -> Condition {
-    Condition {
-        r#type: r#type.to_owned(),
-        status: ConditionStatus::from(holds),
-        reason: reason.to_owned(),
-        message,
-        last_transition_time: None,
-    }
-}
-
 fn conditions(config: &Config, enforced: Result<Enforced, String>) -> Vec<Condition> {
     let mut conditions = match enforced {
         Ok(Enforced { version: 1 }) => vec![
-            condition(QUOTAS_ENFORCED, true, "CgroupV1", String::new()),
-            condition(
+            Condition::new(QUOTAS_ENFORCED, true, "CgroupV1", String::new()),
+            Condition::new(
                 "BufferedWritesThrottled",
                 false,
                 "CgroupV1",
@@ -207,7 +195,7 @@ fn conditions(config: &Config, enforced: Result<Enforced, String>) -> Vec<Condit
             ),
         ],
         Ok(Enforced { .. }) => {
-            vec![condition(QUOTAS_ENFORCED, true, "CgroupV2", String::new())]
+            vec![Condition::new(QUOTAS_ENFORCED, true, "CgroupV2", String::new())]
         }
         Err(why) => {
             let then = if config.unenforced_quotas {
@@ -215,11 +203,11 @@ fn conditions(config: &Config, enforced: Result<Enforced, String>) -> Vec<Condit
             } else {
                 "tasks with quotas are refused"
             };
-            vec![condition(QUOTAS_ENFORCED, false, "NoCgroups", format!("{why}; {then}"))]
+            vec![Condition::new(QUOTAS_ENFORCED, false, "NoCgroups", format!("{why}; {then}"))]
         }
     };
     if !config.actuators.is_empty() {
-        conditions.push(condition(
+        conditions.push(Condition::new(
             "ActuatorsFenced",
             false,
             "NoGate",

@@ -40,6 +40,25 @@ pub struct Condition {
     pub last_transition_time: Option<Time>,
 }
 
+impl Condition {
+    /// A condition as it is said; [`set_condition`] fills in since when.
+    #[must_use]
+    pub fn new(
+        r#type: &str,
+        status: impl Into<ConditionStatus>,
+        reason: &str,
+        message: impl Into<String>,
+    ) -> Self {
+        Condition {
+            r#type: r#type.to_owned(),
+            status: status.into(),
+            reason: reason.to_owned(),
+            message: message.into(),
+            last_transition_time: None,
+        }
+    }
+}
+
 /// The node takes part: its agent has been heard within the detection time.
 pub const READY: &str = "Ready";
 /// A person confirmed that the node is off or that its processes are gone; what it held was given free.

@@ -278,12 +278,9 @@ fn duplicates(manifests: &[Manifest]) -> Vec<Diagnostic> {
 fn rings(manifests: &[Manifest]) -> Vec<Diagnostic> {
     let mut graphs: BTreeMap<&Option<String>, Graph> = BTreeMap::new();
     let tasks = || manifests.iter().filter(|m| m.info.kind == "Task");
-    let named = |task: &Manifest| -> Vec<String> {
-        let all = task.admitted["spec"]["dependsOn"].as_array().into_iter().flatten();
-        all.filter_map(|one| one["task"].as_str().map(str::to_owned)).collect()
-    };
     for task in tasks() {
-        graphs.entry(&task.namespace).or_default().insert(task.name.clone(), named(task));
+        let named = depend::named(&task.admitted);
+        graphs.entry(&task.namespace).or_default().insert(task.name.clone(), named);
     }
     let mut told: BTreeSet<(&Option<String>, String)> = BTreeSet::new();
     let mut problems = Vec::new();
@@ -293,14 +290,7 @@ fn rings(manifests: &[Manifest]) -> Vec<Diagnostic> {
         }
         let Some(ring) = depend::cycle(&graphs[&task.namespace], &task.name) else { continue };
         told.extend(ring.iter().map(|name| (&task.namespace, name.clone())));
-        let at = named(task).iter().position(|name| Some(name) == ring.get(1)).unwrap_or(0);
-        let mut violations = Violations::new();
-        violations
-            .invalid(
-                format!("{}.task", element_path("spec.dependsOn", at)),
-                format!("{} {}", task.title(), depend::ring_text(&ring)),
-            )
-            .suggest("leave out one of them");
+        let violations = depend::ring_refusal(&task.admitted, &ring, &format!("{} ", task.title()));
         problems.extend(violations.into_iter().map(|v| task.part.at(v)));
     }
     problems

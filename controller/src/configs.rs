@@ -3,7 +3,6 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use muster_api::kind::namespace::DEFAULT;
 use muster_api::kind::task::TaskSpec;
 use muster_api::kind::task::config::Source;
 use muster_api::kind::{config_map, secret};
@@ -12,6 +11,7 @@ use muster_controller_core::config::{self, Resolved, Values};
 use muster_controller_core::hold::Hold;
 use serde_json::Value;
 
+use crate::objects;
 use crate::store::{Key, Resource, Store, Stored};
 
 /// ConfigMaps.
@@ -76,20 +76,12 @@ pub fn holds(store: &Store, namespace: &str, spec: &TaskSpec) -> Vec<Hold> {
 /// The same when `objects`, manifests that were admitted, are stored as well.
 #[must_use]
 pub fn holds_with(store: &Store, objects: &[Value], namespace: &str, spec: &TaskSpec) -> Vec<Hold> {
-    let text = |object: &Value, pointer: &str| {
-        object.pointer(pointer).and_then(Value::as_str).map(str::to_owned)
-    };
     let planned = |source: Source, name: &str| {
         let kind = match source {
             Source::ConfigMap => "ConfigMap",
             Source::Secret => "Secret",
         };
-        objects.iter().find(|object| {
-            let there = text(object, "/metadata/namespace").unwrap_or_else(|| DEFAULT.to_owned());
-            text(object, "/kind").as_deref() == Some(kind)
-                && text(object, "/metadata/name").as_deref() == Some(name)
-                && there == namespace
-        })
+        objects::among(objects, kind, (namespace, name))
     };
     let find = |source: Source, name: &str| match planned(source, name) {
         Some(object) => {

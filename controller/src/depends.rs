@@ -2,10 +2,9 @@
 
 use std::collections::BTreeSet;
 
-use muster_api::kind::namespace::DEFAULT;
 use muster_api::kind::task::depend::{self, DependencyCondition, Graph};
 use muster_api::kind::task::{Task, TaskSpec, TaskStatus};
-use muster_api::validate::{Violations, element_path};
+use muster_api::validate::Violations;
 use muster_api::wire::agent::v1 as wire;
 use muster_controller_core::hold::Hold;
 use serde_json::Value;
@@ -50,12 +49,7 @@ pub(crate) fn holds_with(
     namespace: &str,
     spec: &TaskSpec,
 ) -> Vec<Hold> {
-    let planned = |name: &str| {
-        objects.iter().any(|object| {
-            let there = object["metadata"]["namespace"].as_str().unwrap_or(DEFAULT);
-            object["kind"] == "Task" && object["metadata"]["name"] == name && there == namespace
-        })
-    };
+    let planned = |name: &str| objects::among(objects, "Task", (namespace, name)).is_some();
     let hold = |hold: Hold| match hold {
         Hold::DependencyNotFound { task } if planned(&task) => {
             Hold::DependencyNotMet { task, why: "is created with it".to_owned() }
@@ -104,20 +98,16 @@ fn has_ended(task: &Value) -> bool {
 ///
 /// Two that are created in the same moment can still close a ring; both wait then, and each says for which.
 pub(crate) fn check(store: &Store, object: &Value) -> Result<(), Violations> {
-    let named = |task: &Value| -> Vec<String> {
-        let all = task["spec"]["dependsOn"].as_array().into_iter().flatten();
-        all.filter_map(|one| one["task"].as_str().map(str::to_owned)).collect()
-    };
-    let first = named(object);
+    let first = depend::named(object);
     let metadata = &object["metadata"];
     let (Some(name), Some(namespace)) = (metadata["name"].as_str(), metadata["namespace"].as_str())
     else {
         return Ok(());
     };
     let mut graph = Graph::new();
-    let mut left: Vec<String> = first.clone();
+    let mut left = first.clone();
     let mut seen: BTreeSet<String> = BTreeSet::from([name.to_owned()]);
-    graph.insert(name.to_owned(), first.clone());
+    graph.insert(name.to_owned(), first);
     while let Some(next) = left.pop() {
         if !seen.insert(next.clone()) {
             continue;
@@ -125,15 +115,12 @@ pub(crate) fn check(store: &Store, object: &Value) -> Result<(), Violations> {
         let stored = store.get(&key_of(namespace, &next)).filter(|s| s.mentions("dependsOn"));
         // What has ended waits for nobody.
         let value = stored.map(|stored| stored.value()).filter(|task| !has_ended(task));
-        let more = value.as_ref().map(named).unwrap_or_default();
+        let more = value.as_ref().map(depend::named).unwrap_or_default();
         left.extend(more.iter().cloned());
         graph.insert(next, more);
     }
-    let Some(ring) = depend::cycle(&graph, name) else { return Ok(()) };
-    let at = first.iter().position(|task| Some(task) == ring.get(1)).unwrap_or(0);
-    let mut violations = Violations::new();
-    violations
-        .invalid(format!("{}.task", element_path("spec.dependsOn", at)), depend::ring_text(&ring))
-        .suggest("leave out one of them");
-    Err(violations)
+    match depend::cycle(&graph, name) {
+        Some(ring) => Err(depend::ring_refusal(object, &ring, "")),
+        None => Ok(()),
+    }
 }

@@ -6,6 +6,7 @@
 use std::sync::Arc;
 
 use muster_api::kind::lease::{Lease, LeaseSpec};
+use muster_api::kind::namespace::DEFAULT;
 use muster_api::kind::node::Node;
 use muster_api::kind::task::Task;
 use serde::Serialize;
@@ -136,6 +137,19 @@ pub fn stamp_new(
     let whole = jiff::Timestamp::from_second(now.as_second()).unwrap_or(now);
     metadata.creation_timestamp = Some(k8s_openapi::apimachinery::pkg::apis::meta::v1::Time(whole));
     metadata.generation = Some(1);
+}
+
+/// The object of this kind and name among manifests.
+#[must_use]
+pub fn among<'a>(
+    manifests: &'a [Value],
+    kind: &str,
+    (namespace, name): (&str, &str),
+) -> Option<&'a Value> {
+    manifests.iter().find(|object| {
+        let there = object["metadata"]["namespace"].as_str().unwrap_or(DEFAULT);
+        object["kind"] == kind && object["metadata"]["name"] == name && there == namespace
+    })
 }
 
 /// A creation, or a replacement of what is there.

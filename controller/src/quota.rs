@@ -104,14 +104,8 @@ impl Counted {
     }
 
     fn sum(&self) -> Used {
-        let (mut sum, passing) = (self.present.sum().clone(), self.passing.sum());
-        sum.cpu += passing.cpu;
-        sum.memory += passing.memory;
-        sum.leases += passing.leases;
-        sum.tasks += passing.tasks;
-        for (name, amount) in &passing.extended {
-            *sum.extended.entry(name.clone()).or_default() += amount;
-        }
+        let mut sum = self.present.sum().clone();
+        sum.add(self.passing.sum());
         sum
     }
 }

@@ -139,6 +139,33 @@ pub struct Used {
     pub extended: BTreeMap<String, u64>,
 }
 
+impl Used {
+    /// Adds `other` in every dimension.
+    pub fn add(&mut self, other: &Used) {
+        self.cpu += other.cpu;
+        self.memory += other.memory;
+        self.leases += other.leases;
+        self.tasks += other.tasks;
+        for (name, amount) in &other.extended {
+            *self.extended.entry(name.clone()).or_default() += amount;
+        }
+    }
+
+    /// Takes away what [`Used::add`] added before; an extra of which nothing is left is not named any more.
+    pub fn sub(&mut self, other: &Used) {
+        self.cpu = self.cpu.saturating_sub(other.cpu);
+        self.memory = self.memory.saturating_sub(other.memory);
+        self.leases -= other.leases;
+        self.tasks -= other.tasks;
+        for (name, amount) in &other.extended {
+            if let Some(all) = self.extended.get_mut(name) {
+                *all -= amount;
+            }
+        }
+        self.extended.retain(|_, all| *all > 0);
+    }
+}
+
 fn rules(spec: &QuotaSpec, violations: &mut Violations) {
     if !(spec.weight > 0.0 && spec.weight.is_finite()) {
         violations

@@ -37,31 +37,15 @@ impl Requests {
         if self.tasks.contains_key(uid) {
             return;
         }
-        let Used { cpu, memory, leases, tasks, extended } = &mut self.sum;
-        *cpu += asked.cpu;
-        *memory += asked.memory;
-        *leases += asked.leases;
-        *tasks += asked.tasks;
-        for (name, amount) in &asked.extended {
-            *extended.entry(name.clone()).or_default() += amount;
-        }
+        self.sum.add(&asked);
         self.tasks.insert(uid.clone(), asked);
     }
 
     /// Counts a task no longer.
     pub fn remove(&mut self, uid: &TaskUid) {
-        let Some(asked) = self.tasks.remove(uid) else { return };
-        let Used { cpu, memory, leases, tasks, extended } = &mut self.sum;
-        *cpu = cpu.saturating_sub(asked.cpu);
-        *memory = memory.saturating_sub(asked.memory);
-        *leases -= asked.leases;
-        *tasks -= asked.tasks;
-        for (name, amount) in &asked.extended {
-            if let Some(all) = extended.get_mut(name) {
-                *all -= amount;
-            }
+        if let Some(asked) = self.tasks.remove(uid) {
+            self.sum.sub(&asked);
         }
-        extended.retain(|_, all| *all > 0);
     }
 
     /// Of all that are counted.

@@ -9,8 +9,9 @@ use jiff::Timestamp;
 use muster_api::condition::{BATTERY, Condition, ConditionStatus, MAINTENANCE};
 use muster_api::kind::node::upkeep::{
     BATTERY_MARGIN, DEFAULT_MIN_BATTERY, MAINTENANCE_TAINT, MaintenanceWindow, Moment,
+    passing_taint,
 };
-use muster_api::kind::node::{Node, NodeStatus, Taint, TaintEffect};
+use muster_api::kind::node::{Node, NodeStatus};
 use muster_api::kind::task::TaskSpec;
 
 /// What is so of a node now.
@@ -60,8 +61,8 @@ pub fn upkeep(node: &Node, now: Timestamp) -> Upkeep {
             message.as_ref().map(|message| format!("its node is in maintenance {message}"));
     }
     upkeep.conditions.push(match message {
-        Some(message) => condition(MAINTENANCE, true, "WindowOpen", message),
-        None => condition(MAINTENANCE, false, "WindowClosed", String::new()),
+        Some(message) => Condition::new(MAINTENANCE, true, "WindowOpen", message),
+        None => Condition::new(MAINTENANCE, false, "WindowClosed", String::new()),
     });
     upkeep
 }
@@ -76,30 +77,16 @@ fn battery(node: &Node, status: &NodeStatus) -> Option<Condition> {
     let enough = battery.percent >= least.saturating_add(margin).min(100);
     let message = format!("nothing new begins here below {least} %");
     Some(if enough {
-        condition(BATTERY, true, "Charged", String::new())
+        Condition::new(BATTERY, true, "Charged", String::new())
     } else {
-        condition(BATTERY, false, "BatteryLow", message)
+        Condition::new(BATTERY, false, "BatteryLow", message)
     })
-}
-
-fn condition(r#type: &str, holds: bool, reason: &str, message: String) -> Condition {
-    Condition {
-        r#type: r#type.to_owned(),
-        status: holds.into(),
-        reason: reason.to_owned(),
-        message,
-        last_transition_time: None,
-    }
 }
 
 /// Whether a task stays on a node that is drained for maintenance.
 #[must_use]
 pub fn stays(task: &TaskSpec) -> bool {
-    let taint = Taint {
-        key: MAINTENANCE_TAINT.to_owned(),
-        value: String::new(),
-        effect: TaintEffect::NoSchedule,
-    };
+    let taint = passing_taint(MAINTENANCE_TAINT);
     task.placement.tolerations.iter().any(|toleration| toleration.tolerates(&taint))
 }
 

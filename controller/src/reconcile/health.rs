@@ -88,13 +88,12 @@ async fn mark_once(
             }
             let status = object.status.get_or_insert_default();
             status.last_seen = Some(MicroTime(heard));
-            let condition = Condition {
-                r#type: condition::READY.to_owned(),
-                status: ConditionStatus::Unknown,
-                reason: "AgentSilent".to_owned(),
-                message: format!("its agent has not been heard since {heard:.0}"),
-                last_transition_time: None,
-            };
+            let condition = Condition::new(
+                condition::READY,
+                ConditionStatus::Unknown,
+                "AgentSilent",
+                format!("its agent has not been heard since {heard:.0}"),
+            );
             set_condition(&mut status.conditions, condition, &Time(now));
             Some(vec![objects::replace(stored, &object)])
         },

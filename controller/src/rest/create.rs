@@ -96,11 +96,12 @@ pub(crate) fn pass(
     resource: Resource,
     object: &Value,
 ) -> Result<Option<Pass>, Failure> {
-    let Some(entry) = super::registry::of(TASKS).filter(|tasks| tasks.resource == resource) else {
+    if resource != TASKS {
         return Ok(None);
-    };
-    let resources = &object["spec"]["resources"];
-    let resources = match resources {
+    }
+    let entry =
+        super::registry::of(TASKS).ok_or_else(|| Failure::internal("tasks are not served"))?;
+    let resources = match &object["spec"]["resources"] {
         Value::Null => Resources::default(),
         given => Resources::deserialize(given).map_err(|e| Failure::internal(e.to_string()))?,
     };

@@ -137,13 +137,12 @@ fn alive(sessions: &Sessions, name: &NodeName, node: Option<&Node>) -> Option<St
 
 fn mark(context: &Context, node: &mut Node, word: &Word<'_>) {
     let now = context.clock.now();
-    let fenced = Condition {
-        r#type: condition::FENCED.to_owned(),
-        status: ConditionStatus::True,
-        reason: "ConfirmedOff".to_owned(),
-        message: format!("{} confirmed at {now:.0} that it is off: {}", word.who, word.reason),
-        last_transition_time: None,
-    };
+    let fenced = Condition::new(
+        condition::FENCED,
+        ConditionStatus::True,
+        "ConfirmedOff",
+        format!("{} confirmed at {now:.0} that it is off: {}", word.who, word.reason),
+    );
     set_condition(&mut node.status.get_or_insert_default().conditions, fenced, &Time(now));
 }
 

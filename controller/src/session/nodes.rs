@@ -163,13 +163,7 @@ fn judge(status: &mut NodeStatus, strays: &[String], now: jiff::Timestamp) {
     let fenced = fenced.is_some_and(|c| c.status == ConditionStatus::True);
     let conditions = &mut status.conditions;
     let mut set = |r#type: &str, holds: bool, reason: &str, message: String| {
-        let condition = Condition {
-            r#type: r#type.to_owned(),
-            status: holds.into(),
-            reason: reason.to_owned(),
-            message,
-            last_transition_time: None,
-        };
+        let condition = Condition::new(r#type, holds, reason, message);
         set_condition(conditions, condition, &Time(now))
     };
     let news = if strays.is_empty() {

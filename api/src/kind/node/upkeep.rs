@@ -111,13 +111,14 @@ pub fn passing_taints(status: &NodeStatus) -> Vec<Taint> {
         (condition::MAINTENANCE, ConditionStatus::True, MAINTENANCE_TAINT),
     ];
     let is = |r#type: &str, bad| status.condition(r#type).is_some_and(|c| c.status == bad);
-    let taint = |key: &str| Taint {
-        key: key.to_owned(),
-        value: String::new(),
-        effect: TaintEffect::NoSchedule,
-    };
     let holds = bad.into_iter().filter(|(r#type, bad, _)| is(r#type, *bad));
-    holds.map(|(_, _, key)| taint(key)).collect()
+    holds.map(|(_, _, key)| passing_taint(key)).collect()
+}
+
+/// One of them, by its key.
+#[must_use]
+pub fn passing_taint(key: &str) -> Taint {
+    Taint { key: key.to_owned(), value: String::new(), effect: TaintEffect::NoSchedule }
 }
 
 pub(super) fn rules(spec: &NodeSpec, violations: &mut Violations) {

@@ -4,6 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
+use serde_json::Value;
 
 use super::TaskSpec;
 use crate::name::check_name;
@@ -114,10 +115,31 @@ pub fn cycle(graph: &Graph, from: &str) -> Option<Vec<String>> {
     None
 }
 
+/// The tasks that a Task object waits for, in the order of its spec.
+#[must_use]
+pub fn named(task: &Value) -> Vec<String> {
+    let all = task["spec"]["dependsOn"].as_array().into_iter().flatten();
+    all.filter_map(|one| one["task"].as_str().map(str::to_owned)).collect()
+}
+
 /// The words for a ring.
 #[must_use]
 pub fn ring_text(ring: &[String]) -> String {
     format!("waits for itself: {}", ring.join(" → "))
+}
+
+/// Refuses the first task of a ring at the field that leads into it. `who` stands before the words.
+#[must_use]
+pub fn ring_refusal(task: &Value, ring: &[String], who: &str) -> Violations {
+    let at = named(task).iter().position(|name| Some(name) == ring.get(1)).unwrap_or(0);
+    let mut violations = Violations::new();
+    violations
+        .invalid(
+            format!("{}.task", element_path("spec.dependsOn", at)),
+            format!("{who}{}", ring_text(ring)),
+        )
+        .suggest("leave out one of them");
+    violations
 }
 
 #[cfg(test)]

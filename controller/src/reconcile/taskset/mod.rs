@@ -132,13 +132,7 @@ async fn look(context: &Context, index: &Index, key: &Key) -> Result<Next, Store
     };
     let mut plan = plan(&snapshot, now);
     for said in std::mem::take(&mut plan.conditions) {
-        let condition = Condition {
-            r#type: said.condition.to_owned(),
-            status: said.status,
-            reason: said.reason.to_owned(),
-            message: said.message,
-            last_transition_time: None,
-        };
+        let condition = Condition::new(said.condition, said.status, said.reason, said.message);
         set_condition(&mut plan.status.conditions, condition, &Time(now));
     }
     Ok(match write::carry_out(context, &stored, &set, &plan).await? {

@@ -95,13 +95,7 @@ fn say_failure(status: &mut TaskSetStatus, why: Option<&str>, now: Timestamp) {
         status.conditions.retain(|c| c.r#type != REPLICA_FAILURE);
         return;
     };
-    let condition = Condition {
-        r#type: REPLICA_FAILURE.to_owned(),
-        status: ConditionStatus::True,
-        reason: "FailedCreate".to_owned(),
-        message: why.to_owned(),
-        last_transition_time: None,
-    };
+    let condition = Condition::new(REPLICA_FAILURE, ConditionStatus::True, "FailedCreate", why);
     set_condition(&mut status.conditions, condition, &Time(now));
 }
 
