@@ -31,7 +31,8 @@ pub(super) struct Index {
     controlled: HashMap<String, BTreeSet<Key>>,
     /// Tasks with labels that nobody controls.
     loose: BTreeMap<Key, Labels>,
-    nodes: BTreeMap<String, NodeView>,
+    /// Kept only while there are sets, whom alone they concern: ten thousand of them are tens of megabytes.
+    nodes: Option<BTreeMap<String, NodeView>>,
     dirty: BTreeSet<Key>,
 }
 
@@ -67,6 +68,9 @@ impl Index {
     fn take_in_set(&mut self, change: Change, stored: &Arc<Stored>) {
         if change == Change::Delete {
             self.sets.remove(&stored.uid);
+            if self.sets.is_empty() {
+                self.nodes = None;
+            }
             return;
         }
         let Some(set) = objects::read::<TaskSet>(stored) else { return };
@@ -108,17 +112,30 @@ impl Index {
         }
     }
 
+    /// There are sets, and the nodes are not known yet.
+    pub(super) fn lacks_nodes(&self) -> bool {
+        self.nodes.is_none() && !self.sets.is_empty()
+    }
+
+    /// Every node there is. They may be ahead of the events that are still to come: those only say again what is known
+    /// already, or what is known for a moment more.
+    pub(super) fn take_in_nodes<'a>(&mut self, all: impl IntoIterator<Item = &'a Arc<Stored>>) {
+        self.nodes = Some(BTreeMap::new());
+        all.into_iter().for_each(|stored| self.take_in_node(Change::Put, stored));
+    }
+
     fn take_in_node(&mut self, change: Change, stored: &Arc<Stored>) {
+        let Some(nodes) = &mut self.nodes else { return };
         let node = (change == Change::Put).then(|| objects::read::<Node>(stored)).flatten();
         let view = node.map(|node| NodeView::of(&node));
         let name = stored.key.name.to_string();
         // Nodes are written with every placement; few of those changes concern a set.
-        if self.nodes.get(&name) == view.as_ref() {
+        if nodes.get(&name) == view.as_ref() {
             return;
         }
         match view {
-            Some(view) => drop(self.nodes.insert(name, view)),
-            None => drop(self.nodes.remove(&name)),
+            Some(view) => drop(nodes.insert(name, view)),
+            None => drop(nodes.remove(&name)),
         }
         self.dirty.extend(self.sets.values().map(|set| set.key.clone()));
     }
@@ -152,7 +169,8 @@ impl Index {
     }
 
     pub(super) fn nodes(&self) -> &BTreeMap<String, NodeView> {
-        &self.nodes
+        const NONE: &BTreeMap<String, NodeView> = &BTreeMap::new();
+        self.nodes.as_ref().unwrap_or(NONE)
     }
 
     /// The tasks of a set, and those that it could take in, in the order of their names.

@@ -26,7 +26,7 @@ use muster_controller_core::taskset::{Snapshot, plan};
 
 use super::{again, next_events, watch_from_now};
 use crate::context::Context;
-use crate::objects::{self, QUOTAS, REVISIONS};
+use crate::objects::{self, NODES, QUOTAS, REVISIONS};
 use crate::store::{Change, Key, StoreError, Stored};
 use index::Index;
 use write::Outcome;
@@ -51,6 +51,9 @@ async fn follow(context: &Context) -> Result<(), StoreError> {
     }
     let mut later: BTreeMap<Key, Timestamp> = BTreeMap::new();
     loop {
+        if index.lacks_nodes() {
+            index.take_in_nodes(&context.store.list(NODES, None).items);
+        }
         for key in index.take_dirty() {
             later.remove(&key);
             match look(context, &index, &key).await? {
