@@ -18,6 +18,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let agent = protox::compile([package("agent")], [root])?;
     let sessions = protox::compile([package("framework"), package("executor")], [root])?;
     let poses = protox::compile([package("pose")], [root])?;
+    let gate = protox::compile([package("gate")], [root])?;
     let plain = || tonic_prost_build::configure().build_client(false).build_server(false);
     // Values of Secrets: `wire::secret` says how they are shown.
     plain()
@@ -26,6 +27,11 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         .skip_debug([".muster.agent.v1.Variable", ".muster.agent.v1.File"])
         .compile_fds(agent)?;
     plain().compile_fds(poses)?;
+    // Tokens of tasks: `wire::secret` says how they are shown.
+    plain()
+        .bytes(".muster.gate.v1.Command.data")
+        .skip_debug([".muster.gate.v1.Register", ".muster.gate.v1.Seat"])
+        .compile_fds(gate)?;
     plain()
         .bytes(".")
         .compile_well_known_types(true)

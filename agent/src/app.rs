@@ -16,6 +16,7 @@ use std::sync::Arc;
 use rustix::fs::FlockOperation;
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
+use tokio_util::task::AbortOnDropHandle;
 
 use crate::board::Board;
 use crate::capacity;
@@ -28,6 +29,8 @@ use crate::durable::FileError;
 use crate::executor::desk::Desks;
 use crate::executor::work::WorkRuntime;
 use crate::footprint;
+use crate::gate;
+use crate::gate::keeper::{Keeper, end_former};
 use crate::given::files::Place;
 use crate::link::join::{self, Credentials, JoinError};
 use crate::link::session::{Command, Link};
@@ -245,6 +248,13 @@ pub async fn serve(
         tracing::error!(%error, "leftovers were not swept");
     }
     let contact = Arc::new(Contact::open(&contact_file, &boot_id)?);
+    let gate_dir = config.data_dir.join(gate::DIR);
+    let keeper = if config.gate.is_empty() {
+        end_former(&gate_dir).await;
+        None
+    } else {
+        Some(Arc::new(Keeper::new(config.gate.clone(), gate_dir, &reexec)))
+    };
     let desks = Arc::new(Desks::new(checkpoint.clone(), name.clone()));
     let works = WorkRuntime { desks: Arc::clone(&desks), contact: Arc::clone(&contact) };
     let shared = Arc::new(Shared {
@@ -252,6 +262,7 @@ pub async fn serve(
         contact,
         desks,
         works: Arc::new(works) as Arc<dyn Runtime>,
+        gate: keeper.clone(),
         boot_id,
         checkpoint,
         files,
@@ -277,6 +288,8 @@ pub async fn serve(
         commands,
     };
     let engine = tokio::spawn(async move { docker.run().await });
+    // It knows by now which tasks may live: what it says first does not take the robot from any of them.
+    let gate = keeper.clone().map(|keeper| AbortOnDropHandle::new(tokio::spawn(keeper.run())));
     let session = tokio::spawn(link.run(node));
     let mut settled = false;
     loop {
@@ -301,6 +314,11 @@ pub async fn serve(
             () = supervisor.ended() => {}
         }
     }
+    // Before the tasks' drivers go: the robot may go on meanwhile.
+    if let Some(keeper) = &keeper {
+        keeper.leave().await;
+    }
+    drop(gate);
     session.abort();
     engine.abort();
     let _ = (session.await, engine.await);

@@ -15,6 +15,7 @@ use serde::Deserialize;
 
 use crate::declared::Declared;
 use crate::durable::{self, FileError, Keep};
+use crate::gate::settings::Settings as GateSettings;
 use crate::gauge::battery::BatterySource;
 use crate::position::PositionSource;
 use crate::runtime::process::attempt::LogBounds;
@@ -128,6 +129,7 @@ struct FileConfig {
     log_max_size: Option<String>,
     log_max_files: Option<u32>,
     docker_socket: Option<String>,
+    gate: GateSettings,
 }
 
 /// Settings that make sense.
@@ -151,6 +153,8 @@ pub struct Config {
     pub(crate) log: LogBounds,
     /// Absent: no Docker.
     pub(crate) docker_socket: Option<PathBuf>,
+    /// The drivers of the actuators.
+    pub(crate) gate: GateSettings,
     /// To be kept for the next start.
     pub(crate) declared: Declared,
     /// The flags that nobody gave now, and that count as they were given last.
@@ -229,6 +233,13 @@ impl Args {
                 "a cloud node has no sensors and no actuators; use --kind robot".to_owned();
             return Err(ConfigError::Field { field: "--kind", reason });
         }
+        file.gate.check(&actuators).map_err(|error| {
+            let reason = match &self.config {
+                Some(path) => format!("{error} ({})", path.display()),
+                None => error.to_string(),
+            };
+            ConfigError::Field { field: "gate", reason }
+        })?;
         let name = self.name.or(file.name);
         let socket = self.docker_socket.or(file.docker_socket);
         Ok(Config {
@@ -256,6 +267,7 @@ impl Args {
                 Some(path) => Some(PathBuf::from(path)),
                 None => Some(PathBuf::from(DOCKER_SOCKET)),
             },
+            gate: file.gate,
             declared,
             remembered,
         })

@@ -18,7 +18,9 @@ use futures::future::{AbortHandle, Abortable, BoxFuture, FutureExt};
 use futures::stream::{FuturesUnordered, StreamExt};
 use muster_agent_core::desired::{Desired, StopTimes};
 use muster_agent_core::time::Boot;
-use muster_agent_core::workload::{Context, Effect, Event, Outcome, Response, State, Workload};
+use muster_agent_core::workload::{
+    Context, Effect, Event, Failure, Outcome, Response, State, Workload,
+};
 use muster_api::id::TaskUid;
 use tokio::sync::mpsc;
 
@@ -31,15 +33,20 @@ use crate::durable::FileError;
 use crate::executor;
 use crate::executor::desk::Desks;
 use crate::executor::seat::Seat;
+use crate::gate::keeper::Keeper;
 use crate::given;
 use crate::given::files::Place;
 use crate::probe::Probing;
+use crate::runtime::launch::Lease;
 use crate::runtime::{AttemptId, Launch, Launched, Runtime};
 use crate::spec::{self, Kind, Surroundings};
 
 /// Between two tries to make a record durable. Nothing else of the task happens meanwhile: a disk
 /// that is full must not lead to a second run.
 const WRITE_AGAIN: Duration = Duration::from_secs(1);
+
+/// A task that may drive begins when the gate knows it; one that does not know it by then is asked again with the next try.
+const GATE_WITHIN: Duration = Duration::from_secs(5);
 
 /// What every driver uses.
 #[derive(Debug)]
@@ -54,6 +61,8 @@ pub(crate) struct Shared {
     pub(crate) process: Arc<dyn Runtime>,
     pub(crate) docker: Arc<dyn Runtime>,
     pub(crate) works: Arc<dyn Runtime>,
+    /// Absent: nothing stands before the drivers.
+    pub(crate) gate: Option<Arc<Keeper>>,
     /// Memory that tasks may reserve, bytes.
     pub(crate) allocatable_memory: u64,
 }
@@ -73,10 +82,12 @@ impl Shared {
         let reserved = record.assignment.spec.resources.memory.map_or(0, |memory| memory.0);
         let task_dir = self.checkpoint.task_dir(&workload.uid);
         let others = self.board.reserved().saturating_sub(reserved);
+        let gate = self.gate.as_ref().map(|gate| gate.tasks_dir());
         let around = Surroundings {
             node: &self.node,
             task_dir: &task_dir,
             token: &record.token,
+            gate: gate.as_deref(),
             unreserved: self.allocatable_memory.saturating_sub(others),
         };
         let id = AttemptId { uid: workload.uid.clone(), attempt: workload.attempt };
@@ -90,11 +101,24 @@ impl Shared {
         }
     }
 
+    /// Who may connect to the gate: every task of which processes may live, and with its lease to drive.
+    fn admit(&self, record: &Record) {
+        let Some(gate) = &self.gate else { return };
+        let uid = &record.workload.uid;
+        if record.workload.state.may_be_live() {
+            let lease = record.assignment.lease.as_deref().and_then(Lease::from_text);
+            gate.seat(uid, &record.token, lease.map(|lease| lease.epoch));
+        } else {
+            gate.unseat(uid);
+        }
+    }
+
     /// Tasks of an earlier life of the agent: all executors, and then their works. Before any driver
     /// begins: an executor may speak of its works as soon as it can connect.
     pub(crate) fn restore(&self, records: &[Record]) -> Result<(), FileError> {
         for record in records {
             self.enrol(record);
+            self.admit(record);
         }
         let works = records.iter().filter(|record| {
             Kind::of(&record.assignment.spec) == Kind::Work && record.workload.state.may_be_live()
@@ -300,6 +324,7 @@ impl Driver {
     /// Keeps what is known of the task as an executor: before anything is started, and after the
     /// kernel has shown an end.
     async fn attend(&mut self) {
+        self.shared.admit(&self.record);
         if !self.record.workload.state.may_be_live() {
             self.seat = None;
             if self.files {
@@ -393,6 +418,7 @@ impl Driver {
         let launch = self.launch();
         let attempt = launch.id.attempt;
         let ready = given::check(&self.record.assignment.spec, &launch.given);
+        let gate = self.shared.gate.clone().filter(|_| self.record.assignment.lease.is_some());
         let answer = move |outcome| Some(Event::Attempt(attempt, outcome));
         match effect {
             Effect::Prepare(_) => async move {
@@ -405,6 +431,14 @@ impl Driver {
             Effect::Launch(_) => async move {
                 if let Err(failure) = ready {
                     return answer(Outcome::LaunchFailed(failure));
+                }
+                // It must be able to drive as soon as it runs.
+                if let Some(gate) = gate
+                    && tokio::time::timeout(GATE_WITHIN, gate.settled()).await.is_err()
+                {
+                    let message = "the gate before the robot's drivers does not answer".to_owned();
+                    let reason = "GateDown".to_owned();
+                    return answer(Outcome::LaunchFailed(Failure { reason, message, retry: true }));
                 }
                 answer(match runtime.launch(&launch).await {
                     Launched::Running(started) => Outcome::Launched(started),
@@ -539,7 +573,6 @@ mod tests {
     use muster_agent_core::observed::{End, Exit, Observed, Started};
     use muster_agent_core::report::{Phase, Reason, Report};
     use muster_agent_core::time::Wall;
-    use muster_agent_core::workload::Failure;
     use muster_api::wire::agent_session::spec_from_wire;
     use tokio::task::JoinHandle;
 
@@ -566,6 +599,7 @@ mod tests {
             contact: Arc::new(Contact::open(&dir.path().join("contact"), "b").unwrap()),
             desks,
             works: Arc::clone(fake) as Arc<dyn Runtime>,
+            gate: None,
             process: Arc::clone(fake) as Arc<dyn Runtime>,
             docker: Arc::clone(fake) as Arc<dyn Runtime>,
             allocatable_memory: 1 << 30,

@@ -17,6 +17,7 @@
 //! | `depends` | the tasks that a task waits for |
 //! | `given` | what tasks are given of ConfigMaps and Secrets |
 //! | `executor` | tasks that run other tasks, over a socket of their own |
+//! | `gate` | the process that alone talks to the drivers, and what the agent tells it |
 //! | `gauge` | what is read off the machine: battery, disk, labels |
 //! | `footprint` | memory that is given back after the start |
 //! | `contact` | when the controller was last heard, for the shims too |
@@ -39,6 +40,7 @@ mod driver;
 mod durable;
 mod executor;
 mod footprint;
+pub mod gate;
 mod gauge;
 mod given;
 mod link;

@@ -3,7 +3,7 @@
 use std::process::ExitCode;
 
 use clap::Parser;
-use muster_agent::{Reexec, config, shim};
+use muster_agent::{Reexec, config, gate, shim};
 use tracing_subscriber::EnvFilter;
 
 /// Runs tasks on this robot or cloud server, held to their quotas.
@@ -16,9 +16,11 @@ struct Cli {
 
 fn main() -> ExitCode {
     let mut args = std::env::args_os();
-    // Before anything else: a shim must stay small, and it has no use for the rest.
-    if args.nth(1).is_some_and(|verb| verb == shim::VERB) {
-        shim::main(args);
+    // Before anything else: shim and gate must stay small, and they have no use for the rest.
+    match args.nth(1) {
+        Some(verb) if verb == shim::VERB => shim::main(args),
+        Some(verb) if verb == gate::VERB => gate::main(args),
+        _ => {}
     }
     let cli = Cli::parse();
     let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new("info"));

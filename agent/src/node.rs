@@ -5,8 +5,11 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
-use muster_api::condition::{Condition, DISK_PRESSURE, LOCALIZED, QUOTAS_ENFORCED};
+use muster_api::condition::{
+    ACTUATORS_FENCED, Condition, DISK_PRESSURE, EMERGENCY_STOP, LOCALIZED, QUOTAS_ENFORCED,
+};
 use muster_api::kind::node::RuntimeStatus;
+use muster_api::kind::node::estop::EStopStatus;
 use muster_api::pose::Pose;
 use muster_api::wire::agent::v1 as proto;
 use muster_api::wire::agent_session::NodeReport;
@@ -72,6 +75,7 @@ impl Node {
             address: facts.address,
             battery: None,
             mission_locks: Vec::new(),
+            estop: None,
         };
         let position = match facts.kind {
             Kind::Robot => config.position.as_ref().map(|source| source.open(&config.map)),
@@ -138,8 +142,22 @@ impl Node {
         let battery = self.battery.as_ref().and_then(BatteryGauge::charge);
         let mission_locks =
             mission::locks(&self.data_dir, &self.shared.checkpoint, self.shared.board.live());
-        let report =
-            NodeReport { runtimes, conditions, battery, mission_locks, ..self.fixed.clone() };
+        let mut estop = None;
+        if let Some(gate) = &self.shared.gate {
+            let standing = gate.standing();
+            let standing = standing.borrow();
+            conditions.push(standing.fenced(&self.fixed.actuators));
+            estop = standing.estop();
+            conditions.extend(estop.as_ref().map(emergency_stop));
+        }
+        let report = NodeReport {
+            runtimes,
+            conditions,
+            battery,
+            mission_locks,
+            estop,
+            ..self.fixed.clone()
+        };
         let mut state = proto::NodeState::from(&report);
         state.boot_id.clone_from(&self.boot_id);
         state
@@ -183,6 +201,17 @@ fn labels(config: &Config) -> BTreeMap<String, String> {
     labels
 }
 
+fn emergency_stop(estop: &EStopStatus) -> Condition {
+    if estop.tier.is_none() {
+        return Condition::new(EMERGENCY_STOP, false, "Released", String::new());
+    }
+    let demands: Vec<String> =
+        estop.demands.iter().map(|d| format!("{} by {}", d.tier, d.source)).collect();
+    let message =
+        format!("{}; `muster estop NODE --release` lets it move again", demands.join(", "));
+    Condition::new(EMERGENCY_STOP, true, &estop.tier.to_string(), message)
+}
+
 fn conditions(config: &Config, enforced: Result<Enforced, String>) -> Vec<Condition> {
     let mut conditions = match enforced {
         Ok(Enforced { version: 1 }) => vec![
@@ -206,12 +235,13 @@ fn conditions(config: &Config, enforced: Result<Enforced, String>) -> Vec<Condit
             vec![Condition::new(QUOTAS_ENFORCED, false, "NoCgroups", format!("{why}; {then}"))]
         }
     };
-    if !config.actuators.is_empty() {
+    if !config.actuators.is_empty() && config.gate.is_empty() {
         conditions.push(Condition::new(
-            "ActuatorsFenced",
+            ACTUATORS_FENCED,
             false,
             "NoGate",
-            "no gate stands before this robot's drivers: leases are kept, commands are not checked"
+            "no gate stands before this robot's drivers: leases are kept, commands are not checked; \
+             name the drivers under `gate` in agent.yaml"
                 .to_owned(),
         ));
     }

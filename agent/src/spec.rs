@@ -11,6 +11,7 @@ use muster_api::wire::agent_session::spec_from_wire;
 
 use crate::checkpoint::Assignment;
 use crate::executor;
+use crate::gate;
 use crate::probe;
 use crate::runtime::launch::{
     AttemptId, Container, Launch, Lease, Limits, Mount, Network, Program, Pull, Work,
@@ -93,6 +94,8 @@ pub(crate) struct Surroundings<'a> {
     pub(crate) task_dir: &'a Path,
     /// What the task shows at its executor socket.
     pub(crate) token: &'a str,
+    /// Where the gate's socket for tasks is, if there is a gate.
+    pub(crate) gate: Option<&'a Path>,
     /// Memory that nobody reserved, bytes.
     pub(crate) unreserved: u64,
 }
@@ -158,6 +161,10 @@ fn environment(
     env.insert(executor::TOKEN_ENV.to_owned(), around.token.to_owned());
     if let Some(lease) = &assignment.lease {
         env.insert("MUSTER_LEASE".to_owned(), lease.clone());
+    }
+    if let Some(dir) = around.gate {
+        env.insert(gate::SOCKET_ENV.to_owned(), dir.join(gate::SOCKET).display().to_string());
+        env.insert(gate::TOKEN_ENV.to_owned(), around.token.to_owned());
     }
     env
 }

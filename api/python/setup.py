@@ -15,7 +15,11 @@ from setuptools.command.build_py import build_py
 from setuptools.command.sdist import sdist
 
 HERE = Path(__file__).parent.resolve()
-CONTRACTS = ["muster/framework/v1/framework.proto", "muster/executor/v1/executor.proto"]
+CONTRACTS = [
+    "muster/framework/v1/framework.proto",
+    "muster/executor/v1/executor.proto",
+    "muster/gate/v1/gate.proto",
+]
 # Below a package of their own: what stands directly in `muster` is the SDK.
 GENERATED = "muster/_proto"
 

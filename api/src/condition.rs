@@ -69,6 +69,10 @@ pub const BATTERY: &str = "Battery";
 pub const MAINTENANCE: &str = "Maintenance";
 /// The disk of the agent's data directory is nearly full: nothing new begins there.
 pub const DISK_PRESSURE: &str = "DiskPressure";
+/// Every actuator of the robot has a driver behind the gate, which is there: commands are checked, and stops reach it.
+pub const ACTUATORS_FENCED: &str = "ActuatorsFenced";
+/// An emergency stop is in force on the robot.
+pub const EMERGENCY_STOP: &str = "EmergencyStop";
 /// The robot knows where it is.
 pub const LOCALIZED: &str = "Localized";
 /// Quotas of tasks are enforced by the kernel on this node (invariant 7).

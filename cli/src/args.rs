@@ -9,8 +9,8 @@ use muster_api::selector::{FieldSelector, LabelSelector, SelectorError};
 
 use crate::client::Selection;
 use crate::command::{
-    apply, cordon, create, delete, describe, drain, get, local, logs, node, offers, plan, rollout,
-    scale, token, top, version, wait, why,
+    apply, cordon, create, delete, describe, drain, estop, get, local, logs, node, offers, plan,
+    rollout, scale, token, top, version, wait, why,
 };
 use crate::output::ui::Color;
 
@@ -89,6 +89,8 @@ pub(crate) enum Command {
     Uncordon(cordon::Args),
     /// Cordon a node and end the tasks on it
     Drain(drain::Args),
+    /// Stop robots at once, whoever holds them
+    Estop(estop::Args),
     /// Register nodes, and fence those that are lost
     #[command(subcommand)]
     Node(node::Command),

@@ -34,9 +34,11 @@ use crate::output::ui::Ui;
 
 fn main() -> ExitCode {
     let mut args = std::env::args_os();
-    // Before anything else: a shim must stay small, and it has no use for the rest.
-    if args.nth(1).is_some_and(|verb| verb == muster_agent::shim::VERB) {
-        muster_agent::shim::main(args);
+    // Before anything else: shim and gate must stay small, and they have no use for the rest.
+    match args.nth(1) {
+        Some(verb) if verb == muster_agent::shim::VERB => muster_agent::shim::main(args),
+        Some(verb) if verb == muster_agent::gate::VERB => muster_agent::gate::main(args),
+        _ => {}
     }
     // Before anything makes a TLS configuration. An error means that there is a provider already.
     let _ = rustls::crypto::ring::default_provider().install_default();

@@ -12,6 +12,7 @@
 //! | [`depend`] | the tasks that a task waits for: how far they are, and who was started again |
 //! | [`report`] | what is told to the controller, and its sequence |
 //! | [`executor`] | an executor and the works it was given: who may end, and on whose word |
+//! | [`gate`] | who may command the robot's actuators, and when the robot is stopped |
 //! | [`plan`] | a set of assignments against the tasks that are known: who gets which event |
 //!
 //! The executor (`muster-agent`'s `driver`) keeps three promises that the proofs here rest on:
@@ -23,6 +24,7 @@ pub mod depend;
 pub mod desired;
 pub mod event;
 pub mod executor;
+pub mod gate;
 pub mod observed;
 pub mod plan;
 pub mod probe;

@@ -25,6 +25,7 @@ use crate::checkpoint::{self, Checkpoint, Framework};
 use crate::clock;
 use crate::driver::chain;
 use crate::durable::{self, FileError, Keep};
+use crate::gate;
 use crate::runtime::launch::{AttemptId, Launch, Limits, Program};
 use crate::runtime::{Runtime, RuntimeError};
 
@@ -442,6 +443,7 @@ fn handed(launch: &Launch) -> Option<Handed> {
             node: lease.node.clone(),
             group: lease.group.clone(),
             epoch: lease.epoch,
+            gate_token: launch.env.get(gate::TOKEN_ENV).cloned().unwrap_or_default(),
         }),
     };
     Some(Handed { launch: launch_message, limits: launch.limits })

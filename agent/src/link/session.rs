@@ -32,6 +32,7 @@ use super::{Address, report, tls};
 use crate::clock;
 use crate::driver::{Shared, chain};
 use crate::executor::frame::FRAME_MAX;
+use crate::gate::keeper::Standing;
 use crate::node::Node;
 
 /// The client's side of the service.
@@ -187,6 +188,18 @@ impl Link {
     }
 }
 
+/// Cancel-safe: a change that was seen is one that was returned.
+async fn changed(standing: &mut Option<watch::Receiver<Standing>>) {
+    let closed = match standing {
+        Some(standing) => standing.changed().await.is_err(),
+        None => true,
+    };
+    // The gate's keeper ends with the agent.
+    if closed {
+        std::future::pending().await
+    }
+}
+
 struct Session<'a> {
     link: &'a Link,
     node: &'a mut Node,
@@ -210,6 +223,7 @@ impl Session<'_> {
         beats.set_missed_tick_behavior(MissedTickBehavior::Delay);
         let shared = Arc::clone(&self.link.shared);
         let mut executors = shared.desks.executors();
+        let mut gate = shared.gate.as_ref().map(|gate| gate.standing());
         self.say_executors(&mut executors).await?;
         let mut last_heard = Instant::now();
         loop {
@@ -232,6 +246,12 @@ impl Session<'_> {
                 () = shared.board.changed() => self.say_reports().await?,
                 // Closed: the desks end with the agent.
                 Ok(()) = executors.changed() => self.say_executors(&mut executors).await?,
+                () = changed(&mut gate) => {
+                    // A stop is told at once; whoever ordered it waits for that.
+                    if let Some(state) = self.node.changed() {
+                        self.say(Say::Node(state)).await?;
+                    }
+                }
                 pose = self.node.moved() => self.say(Say::Pose(pose)).await?,
                 _ = beats.tick() => {
                     if last_heard.elapsed() > DEAF_AFTER.max(interval * 4) {
@@ -267,6 +287,13 @@ impl Session<'_> {
             }
             Hear::Log(request) => self.start_reader(request).await,
             Hear::Message(message) => self.link.shared.desks.deliver(message),
+            Hear::Order(order) => match &self.link.shared.gate {
+                Some(gate) => gate.demand(order.estop_tier, order.estop_release),
+                None if order.estop_tier > 0 => {
+                    tracing::error!("an emergency stop, and no gate stands before the drivers");
+                }
+                None => {}
+            },
             Hear::LogCancel(cancel) => {
                 if let Some(reader) = self.requests.remove(&cancel.id) {
                     reader.abort();

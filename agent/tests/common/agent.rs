@@ -132,6 +132,12 @@ impl Agent {
         })
     }
 
+    /// The pid of the gate before the robot's drivers; 0 while there is none.
+    pub fn gate_pid(&self) -> i32 {
+        let pid = std::fs::read_to_string(self.dir.path().join("gate/lock")).unwrap_or_default();
+        pid.trim().parse().unwrap_or(0)
+    }
+
     /// The directory of an attempt's group for a controller.
     #[track_caller]
     pub fn group(&self, uid: &str, attempt: u32, controller: &str) -> PathBuf {
@@ -162,6 +168,11 @@ impl Drop for Agent {
             .and_then(|text| serde_json::from_slice::<serde_json::Value>(&text).ok())
             .and_then(|identity| identity["id"].as_str().map(str::to_owned));
         self.kill();
+        let gate = self.gate_pid();
+        if gate > 0 && super::lives(gate) {
+            // SAFETY: a signal to a process that this agent started, and that was just seen.
+            unsafe { libc::kill(gate, libc::SIGKILL) };
+        }
         // The tasks outlive their agent, so the test has to end them.
         for entry in std::fs::read_dir(self.dir.path().join("tasks")).into_iter().flatten() {
             let uid = entry.unwrap().file_name().into_string().unwrap();

@@ -61,6 +61,7 @@ struct Seen {
     mute: bool,
     /// Sessions are refused.
     away: bool,
+    order: Option<proto::NodeOrder>,
     joins: u32,
 }
 
@@ -261,6 +262,13 @@ impl Controller {
         self.seen(|seen| seen.executors.clone())
     }
 
+    /// What a person decides about the node.
+    pub fn order_estop(&self, estop_tier: u32, estop_release: u64) {
+        let order = proto::NodeOrder { estop_tier, estop_release };
+        self.seen(|seen| seen.order = Some(order));
+        self.say(Say::Order(order));
+    }
+
     pub fn cancel_logs(&self, id: u64) {
         self.say(Say::LogCancel(proto::LogCancel { id }));
     }
@@ -426,6 +434,7 @@ impl AgentService for Service {
                 released: vec![],
                 kept: Vec::new(),
             }));
+            say(Say::Order(seen.order.unwrap_or_default()));
             seen.session = Some(out);
         }
         tokio::spawn(async move {

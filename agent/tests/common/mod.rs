@@ -13,6 +13,7 @@ pub mod agent;
 pub mod controller;
 pub mod cpu;
 pub mod executor;
+pub mod gate;
 
 use std::time::{Duration, Instant};
 

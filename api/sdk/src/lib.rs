@@ -17,6 +17,7 @@
 //! | [`position`] | where the work is, and sources that move it |
 //! | [`filter`] | what a node must have to be offered |
 //! | [`poses`] | for a building's localisation: a stream of robots' poses |
+//! | [`gate`] | for tasks: commands for a robot's actuators |
 //! | [`executor`] | the other side: a program that runs a framework's tasks |
 //! | `link` | the session: kubeconfig, TLS, reconnecting, duplicates |
 //!
@@ -30,6 +31,7 @@ pub mod event;
 pub mod executor;
 pub mod filter;
 pub mod framework;
+pub mod gate;
 pub mod handle;
 pub mod launch;
 mod link;

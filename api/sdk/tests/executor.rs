@@ -73,7 +73,12 @@ impl Connection {
             task: task.to_owned(),
             name: "go".to_owned(),
             data: data.as_object().map(struct_of),
-            lease: Some(proto::Lease { node: "tb1".into(), group: "body".into(), epoch: 4 }),
+            lease: Some(proto::Lease {
+                node: "tb1".into(),
+                group: "body".into(),
+                epoch: 4,
+                gate_token: String::new(),
+            }),
         };
         self.say(Tell::Launch(launch)).await;
     }

@@ -8,8 +8,9 @@ use k8s_openapi::jiff::Timestamp;
 use super::WireError;
 use super::agent::v1 as proto;
 use crate::condition::{Condition, ConditionStatus};
+use crate::kind::node::estop::{EStopDemand, EStopStatus, EStopTier};
 use crate::kind::node::upkeep::Battery;
-use crate::kind::node::{MissionLock, NodeKind, RuntimeStatus};
+use crate::kind::node::{MissionLock, NodeKind, NodeSpec, RuntimeStatus};
 use crate::kind::task::depend::DependencyCondition;
 use crate::kind::task::{TaskSpec, TaskUsage};
 use crate::name::FunctionName;
@@ -210,6 +211,8 @@ pub struct NodeReport {
     pub battery: Option<Battery>,
     /// Mission locks that are set on the node itself.
     pub mission_locks: Vec<MissionLock>,
+    /// What stops the robot; none: nothing stands before its drivers.
+    pub estop: Option<EStopStatus>,
 }
 
 impl TryFrom<&proto::NodeState> for NodeReport {
@@ -248,7 +251,45 @@ impl TryFrom<&proto::NodeState> for NodeReport {
                     reason: lock.reason.clone(),
                 })
                 .collect(),
+            estop: state.estop.as_ref().map(EStopStatus::from),
         })
+    }
+}
+
+impl From<&proto::EStop> for EStopStatus {
+    fn from(wire: &proto::EStop) -> Self {
+        let demand = |demand: &proto::EStopDemand| EStopDemand {
+            source: demand.source.clone(),
+            tier: EStopTier::from_number(demand.tier),
+        };
+        EStopStatus {
+            tier: EStopTier::from_number(wire.tier),
+            number: wire.number,
+            demands: wire.demands.iter().map(demand).collect(),
+        }
+    }
+}
+
+impl From<&EStopStatus> for proto::EStop {
+    fn from(status: &EStopStatus) -> Self {
+        let demand = |demand: &EStopDemand| proto::EStopDemand {
+            source: demand.source.clone(),
+            tier: demand.tier.number(),
+        };
+        proto::EStop {
+            tier: status.tier.number(),
+            number: status.number,
+            demands: status.demands.iter().map(demand).collect(),
+        }
+    }
+}
+
+/// What people decide about a node that its agent must know.
+#[must_use]
+pub fn node_order(spec: &NodeSpec) -> proto::NodeOrder {
+    proto::NodeOrder {
+        estop_tier: spec.estop.number(),
+        estop_release: spec.estop_release.unwrap_or_default(),
     }
 }
 
@@ -289,6 +330,7 @@ impl From<&NodeReport> for proto::NodeState {
                     reason: lock.reason.clone(),
                 })
                 .collect(),
+            estop: report.estop.as_ref().map(proto::EStop::from),
         }
     }
 }
@@ -366,6 +408,14 @@ mod tests {
                 holder: "task default/patrol".to_owned(),
                 reason: "carries a tray".to_owned(),
             }],
+            estop: Some(EStopStatus {
+                tier: EStopTier::Cut,
+                number: 3,
+                demands: vec![EStopDemand {
+                    source: "button on the robot".to_owned(),
+                    tier: EStopTier::Cut,
+                }],
+            }),
         }
     }
 

@@ -66,6 +66,21 @@ pub mod agent {
     }
 }
 
+/// Package `muster.gate`.
+pub mod gate {
+    /// Messages between a robot's gate and those who command its actuators.
+    #[expect(missing_docs, reason = "generated; the .proto files hold the documentation")]
+    #[allow(
+        clippy::all,
+        clippy::allow_attributes,
+        clippy::allow_attributes_without_reason,
+        reason = "generated"
+    )]
+    pub mod v1 {
+        include!(concat!(env!("OUT_DIR"), "/muster.gate.v1.rs"));
+    }
+}
+
 /// Package `muster.pose`.
 pub mod pose {
     /// Messages of a stream of poses.

@@ -7,6 +7,7 @@ pub(crate) mod create;
 pub(crate) mod delete;
 pub(crate) mod describe;
 pub(crate) mod drain;
+pub(crate) mod estop;
 pub(crate) mod fence;
 pub(crate) mod get;
 pub(crate) mod gone;
@@ -88,6 +89,7 @@ pub(crate) async fn dispatch(command: Command, session: &mut Session) -> Outcome
         Command::Cordon(args) => cordon::run(args, true, session).await,
         Command::Uncordon(args) => cordon::run(args, false, session).await,
         Command::Drain(args) => drain::run(args, session).await,
+        Command::Estop(args) => estop::run(args, session).await,
         Command::Node(command) => node::run(command, session).await,
         Command::Token(command) => token::run(command, session).await,
         Command::Local(_) | Command::Version(_) => {

@@ -14,6 +14,7 @@
 //! | [`health`] | heartbeats | marks silent nodes and their tasks |
 //! | [`taskset`] | TaskSets, their tasks, nodes | begins and ends tasks, changes them, goes back |
 //! | [`upkeep`] | Nodes with batteries and maintenance windows | says when nothing new begins there, ends what is to be gone |
+//! | [`orders`] | Nodes | tells their agents of emergency stops |
 //! | [`deletion`] | Tasks being deleted | removes those whose processes are gone |
 //! | [`garbage`] | ownerReferences | deletes what lost its owner |
 //! | [`history`] | Events, the store's history | forgets what is old |
@@ -29,6 +30,7 @@ pub mod garbage;
 pub mod health;
 pub mod history;
 mod moves;
+pub mod orders;
 mod preempt;
 pub mod quotas;
 pub mod schedule;
@@ -88,6 +90,7 @@ pub fn spawn(
     run("garbage", Box::pin(garbage::run(Arc::clone(context))));
     run("taskset", Box::pin(taskset::run(Arc::clone(context))));
     run("upkeep", Box::pin(upkeep::run(Arc::clone(context))));
+    run("orders", Box::pin(orders::run(Arc::clone(context), Arc::clone(sessions))));
     run("history", Box::pin(history::run(Arc::clone(context))));
     run("board", Box::pin(crate::session::board::run(Arc::clone(context), Arc::clone(sessions))));
     run("poses", Box::pin(poses::run(Arc::clone(context), Arc::clone(poses))));

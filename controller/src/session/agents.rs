@@ -14,10 +14,11 @@ use std::time::Duration;
 
 use futures::Stream;
 use muster_api::id::{Incarnation, TaskUid};
+use muster_api::kind::node::Node;
 use muster_api::name::NodeName;
 use muster_api::pose::Pose;
 use muster_api::wire::agent::v1 as wire;
-use muster_api::wire::agent_session::NodeReport;
+use muster_api::wire::agent_session::{NodeReport, node_order};
 use muster_controller_core::node_health::{DETECT_AFTER, HEARTBEAT_EVERY};
 use muster_controller_core::stray::Strays;
 use tokio::sync::{Notify, mpsc};
@@ -177,6 +178,11 @@ impl Session {
         hello_written.store(true, Ordering::Release);
         drop(beginning);
         self.send(ToAgent::Welcome(welcome())).await?;
+        // What changes from now on comes from `reconcile::orders`, behind this.
+        let stored = self.context.store.get(&objects::node_key(self.node.as_str()));
+        if let Some(object) = stored.and_then(|stored| objects::read::<Node>(&stored)) {
+            self.send(ToAgent::Order(node_order(&object.spec))).await?;
+        }
         let wake = self.send_page(&hello.tasks).await?;
         for report in &hello.tasks {
             self.acknowledge(report).await?;

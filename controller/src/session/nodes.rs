@@ -141,6 +141,7 @@ fn fill(context: &Context, speaker: &Speaker, report: &NodeReport, node: &mut No
     status.address.clone_from(&report.address);
     status.battery = report.battery;
     status.mission_locks.clone_from(&report.mission_locks);
+    status.estop.clone_from(&report.estop);
     if let Some(pose) = &report.pose
         && status
             .pose

@@ -8,6 +8,7 @@ mod examples;
 mod fence;
 mod figure4;
 mod frameworks;
+mod gate;
 mod lease;
 mod missions;
 mod poses;

@@ -1,6 +1,7 @@
 //! A launch as the engine wants it.
 
 use std::collections::HashMap;
+use std::path::Path;
 
 use bollard::models::{
     ContainerCreateBody, ContainerUpdateBody, HostConfig, HostConfigLogConfig, Mount, MountType,
@@ -10,6 +11,7 @@ use muster_agent_core::workload::Failure;
 
 use super::DockerConfig;
 use crate::executor;
+use crate::gate;
 use crate::runtime::cgroup::device;
 use crate::runtime::launch::{Container, Launch, Limits, Network, Program};
 
@@ -25,6 +27,9 @@ const RUN_DIR: &str = "/run/muster";
 
 /// Where a container sees the directory of its executor socket.
 const EXECUTOR_DIR: &str = "/run/muster-executor";
+
+/// Where a container finds the gate's socket.
+const GATE_DIR: &str = "/run/muster-gate";
 
 /// The least cpu weight that the engine gives: that of a task which reserved none.
 const MIN_SHARES: i64 = 2;
@@ -47,6 +52,9 @@ pub(super) fn body(launch: &Launch, config: &DockerConfig) -> Result<ContainerCr
     env.insert("MUSTER_RUN_DIR".to_owned(), RUN_DIR.to_owned());
     let socket = format!("{EXECUTOR_DIR}/{}", executor::SOCKET);
     env.insert(executor::SOCKET_ENV.to_owned(), socket);
+    if env.contains_key(gate::SOCKET_ENV) {
+        env.insert(gate::SOCKET_ENV.to_owned(), format!("{GATE_DIR}/{}", gate::SOCKET));
+    }
     // Who may use the engine sees them, as everything of a container.
     let given = launch.given.iter().flat_map(|given| &given.variables);
     env.extend(given.map(|variable| (variable.name.clone(), variable.value.clone())));
@@ -84,6 +92,11 @@ fn host(
     let seat = config.tasks.join(launch.id.uid.as_str()).join(executor::DIR);
     if seat.exists() {
         mounts.push(mount(&seat.display().to_string(), EXECUTOR_DIR, true));
+    }
+    // As the launch knows it; the directory outlives every gate.
+    let gate = launch.env.get(gate::SOCKET_ENV).map(Path::new).and_then(Path::parent);
+    if let Some(dir) = gate.filter(|dir| dir.exists()) {
+        mounts.push(mount(&dir.display().to_string(), GATE_DIR, true));
     }
     mounts.extend(container.mounts.iter().map(|m| mount(&m.host, &m.container, m.read_only)));
     let files = config.files.bound(launch);

@@ -24,6 +24,7 @@ from muster.errors import (
 )
 from muster.executor_driver import ExecutorDriver
 from muster.executors import Executor, ExecutorInfo, ExecutorTask, ExecutorTaskState, Lease
+from muster.gate import Gate, GateAnswer, Verdict
 from muster.model import (
     Compute,
     Cost,
@@ -65,6 +66,8 @@ __all__ = [
     "Filter",
     "FrameworkError",
     "FrameworkInfo",
+    "Gate",
+    "GateAnswer",
     "LaunchResult",
     "Launched",
     "Launching",
@@ -85,6 +88,7 @@ __all__ = [
     "TaskInfo",
     "TaskState",
     "TaskStatus",
+    "Verdict",
     "WireError",
     "container",
     "executor",

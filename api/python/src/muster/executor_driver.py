@@ -144,7 +144,9 @@ class ExecutorDriver(Life):
 
 
 def _task(launch: pb.Launch) -> ExecutorTask:
-    lease = Lease(launch.lease.node, launch.lease.group, launch.lease.epoch) if launch.HasField("lease") else None
+    lease = None
+    if launch.HasField("lease"):
+        lease = Lease(launch.lease.node, launch.lease.group, launch.lease.epoch, launch.lease.gate_token)
     return ExecutorTask(launch.task, launch.name, json_format.MessageToDict(launch.data), lease)
 
 

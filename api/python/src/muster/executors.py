@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import enum
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Optional
 
 from muster._names import Foreign, adopt
@@ -48,6 +48,8 @@ class Lease:
     node: str
     group: str
     epoch: int
+    #: What is shown to the gate to drive for this task (``Gate(token=…)``); empty: no gate stands before the drivers.
+    gate_token: str = field(default="", repr=False, compare=False)
 
     def __str__(self) -> str:
         """As ``MUSTER_LEASE`` has it for tasks that are processes."""

@@ -17,7 +17,7 @@
 
 mod book;
 mod connection;
-mod frame;
+pub(crate) mod frame;
 
 use std::ffi::OsString;
 use std::future::Future;

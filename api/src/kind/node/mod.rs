@@ -1,5 +1,6 @@
 //! Node: a robot or a cloud server that runs an agent.
 
+pub mod estop;
 pub mod upkeep;
 
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::MicroTime;
@@ -15,6 +16,7 @@ use crate::name::FunctionName;
 use crate::pose::Pose;
 use crate::resource::Compute;
 use crate::validate::{Violations, element_path};
+use estop::{EStopStatus, EStopTier};
 use upkeep::{Battery, MaintenanceWindow};
 
 /// What a node is.
@@ -59,6 +61,12 @@ pub struct NodeSpec {
     /// When people work on it.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub maintenance: Vec<MaintenanceWindow>,
+    /// How far the robot is to be stopped, whoever holds it (`muster estop`).
+    #[serde(default, skip_serializing_if = "EStopTier::is_none")]
+    pub estop: EStopTier,
+    /// A person has released the robot's own stops up to this number (see `status.estop.number`).
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub estop_release: Option<u64>,
 }
 
 impl NodeSpec {
@@ -72,6 +80,8 @@ impl NodeSpec {
             speed: None,
             min_battery: None,
             maintenance: Vec::new(),
+            estop: EStopTier::None,
+            estop_release: None,
         }
     }
 }
@@ -160,6 +170,9 @@ pub struct NodeStatus {
     /// Mission locks that are set on the node itself, by its tasks or by people there.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub mission_locks: Vec<MissionLock>,
+    /// What stops the robot; none: nothing stands before its drivers.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub estop: Option<EStopStatus>,
     /// Facts about the node; `Ready`, `Fenced`, `Battery` and `Maintenance` are the controller's, the others are the
     /// agent's.
     #[serde(skip_serializing_if = "Vec::is_empty")]
@@ -246,6 +259,9 @@ fn rules(spec: &NodeSpec, violations: &mut Violations) {
     }
     if spec.kind == NodeKind::Cloud && spec.speed.is_some() {
         violations.forbidden("spec.speed", "a Cloud node does not move").suggest("leave it out");
+    }
+    if spec.kind == NodeKind::Cloud && !spec.estop.is_none() {
+        violations.forbidden("spec.estop", "a Cloud node does not move").suggest("leave it out");
     }
     upkeep::rules(spec, violations);
 }

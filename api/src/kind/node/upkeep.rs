@@ -5,6 +5,7 @@ use k8s_openapi::jiff::{SignedDuration, Timestamp};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
+use super::estop::ESTOP_TAINT;
 use super::{NodeKind, NodeSpec, Taint, TaintEffect};
 use crate::condition::{self, ConditionStatus};
 use crate::duration::Span;
@@ -109,6 +110,7 @@ pub fn passing_taints(status: &NodeStatus) -> Vec<Taint> {
         (condition::DISK_PRESSURE, ConditionStatus::True, DISK_PRESSURE_TAINT),
         (condition::BATTERY, ConditionStatus::False, BATTERY_LOW_TAINT),
         (condition::MAINTENANCE, ConditionStatus::True, MAINTENANCE_TAINT),
+        (condition::EMERGENCY_STOP, ConditionStatus::True, ESTOP_TAINT),
     ];
     let is = |r#type: &str, bad| status.condition(r#type).is_some_and(|c| c.status == bad);
     let holds = bad.into_iter().filter(|(r#type, bad, _)| is(r#type, *bad));

@@ -1,0 +1,297 @@
+//! How a robot's drivers and its emergency stops are reached: `gate` of `agent.yaml`, and the same as the gate reads it.
+//!
+//! ```yaml
+//! gate:
+//!   drivers:
+//!     - actuators: ["base:Drive"]
+//!       exec: [/usr/lib/robot/base-driver]     # or unix: /run/robot/base.sock
+//!       stop: '{"linear": 0, "angular": 0}'
+//!   ladder: [{after: 200ms, action: Stop}, {after: 10s, action: Release}]
+//!   agentGrace: 0s
+//!   estop:
+//!     - {name: button, gpio: /sys/class/gpio/gpio17/value, activeLow: true}
+//!     - {name: fence, file: /run/robot/estop}
+//! ```
+
+use std::collections::BTreeSet;
+use std::path::{Path, PathBuf};
+
+use muster_agent_core::gate::{self, Action, Step, Tier};
+use muster_api::duration::Span;
+use muster_api::name::FunctionName;
+use serde::{Deserialize, Serialize};
+
+/// The file, in the gate's directory.
+pub(super) const FILE: &str = "settings.json";
+
+/// What stands before the robot's drivers.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "camelCase", deny_unknown_fields, default)]
+pub(crate) struct Settings {
+    /// The drivers of the robot's actuators.
+    pub(crate) drivers: Vec<Driver>,
+    /// What follows when whoever drives is silent; absent: stop after 200 ms.
+    ladder: Option<Vec<Rung>>,
+    /// How long the robot may go on when the agent is gone.
+    agent_grace: Span,
+    /// What stops the robot on the robot.
+    pub(crate) estop: Vec<Hook>,
+}
+
+/// One step of the ladder.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Rung {
+    after: Span,
+    action: Action,
+}
+
+/// A driver: the program that moves something.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "camelCase", deny_unknown_fields)]
+pub(crate) struct Driver {
+    /// What it moves.
+    pub(crate) actuators: BTreeSet<FunctionName>,
+    /// A program that the gate starts; it reads commands from its standard input, and ends with it.
+    #[serde(default)]
+    pub(super) exec: Vec<String>,
+    /// A Unix socket on which it listens.
+    #[serde(default)]
+    pub(super) unix: Option<PathBuf>,
+    /// How commands are kept apart.
+    #[serde(default)]
+    pub(super) framing: Framing,
+    /// The command that stops what it moves.
+    pub(super) stop: String,
+    /// The command to stay as it is; absent: the stop command.
+    #[serde(default)]
+    pub(super) hold: Option<String>,
+    /// The command that cuts the power; absent: the driver is ended, or its socket closed.
+    #[serde(default)]
+    pub(super) cut: Option<String>,
+}
+
+/// How commands are kept apart.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub(super) enum Framing {
+    /// A newline after each; none may hold one.
+    #[default]
+    Lines,
+    /// A big-endian 32-bit length before each.
+    Length,
+}
+
+/// Something on the robot that stops it.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "camelCase", deny_unknown_fields)]
+pub(crate) struct Hook {
+    /// As it is called in the node's status.
+    pub(super) name: String,
+    /// A file with one word, none, settle or cut. One that is not there demands nothing; one that cannot be read, or says something
+    /// else, demands that the robot settles.
+    #[serde(default)]
+    pub(super) file: Option<PathBuf>,
+    /// The value file of a pin (`/sys/class/gpio/gpioN/value`). One that cannot be read counts as pressed.
+    #[serde(default)]
+    pub(super) gpio: Option<PathBuf>,
+    /// The pin is pressed at 0: a cut wire stops the robot.
+    #[serde(default)]
+    pub(super) active_low: bool,
+    /// What the pin demands.
+    #[serde(default = "cut")]
+    pub(super) tier: Tier,
+}
+
+fn cut() -> Tier {
+    Tier::Cut
+}
+
+/// Why settings make no sense.
+#[derive(Debug, thiserror::Error)]
+pub(crate) enum SettingsError {
+    #[error("drivers[{0}]: give exactly one of exec and unix")]
+    Way(usize),
+    #[error("drivers[{0}].actuators: name what it moves, as in [\"base:Drive\"]")]
+    NoActuators(usize),
+    #[error(
+        "drivers[{at}].actuators: {actuator} has a driver already; the gate needs one for each"
+    )]
+    Twice { at: usize, actuator: FunctionName },
+    #[error(
+        "drivers[{at}].actuators: {actuator} is not among the node's actuators; add it to --ar-res"
+    )]
+    NotDeclared { at: usize, actuator: FunctionName },
+    #[error("drivers[{at}].{field}: a command with a newline needs `framing: Length`")]
+    Newline { at: usize, field: &'static str },
+    #[error("estop[{0}]: give exactly one of file and gpio")]
+    HookWay(usize),
+    #[error("estop[{at}].name: {name:?} is taken, or empty; each needs a name of its own")]
+    HookName { at: usize, name: String },
+    #[error("estop[{0}].tier: Settle or Cut; a pin that demands nothing stops nothing")]
+    HookTier(usize),
+}
+
+impl Settings {
+    /// Nothing stands before the drivers.
+    pub(crate) fn is_empty(&self) -> bool {
+        self.drivers.is_empty()
+    }
+
+    /// Says what makes no sense.
+    pub(crate) fn check(&self, actuators: &BTreeSet<FunctionName>) -> Result<(), SettingsError> {
+        let mut driven = BTreeSet::new();
+        for (at, driver) in self.drivers.iter().enumerate() {
+            if driver.exec.is_empty() == driver.unix.is_none() {
+                return Err(SettingsError::Way(at));
+            }
+            if driver.actuators.is_empty() {
+                return Err(SettingsError::NoActuators(at));
+            }
+            for actuator in &driver.actuators {
+                let actuator = actuator.clone();
+                if !actuators.contains(&actuator) {
+                    return Err(SettingsError::NotDeclared { at, actuator });
+                }
+                if !driven.insert(actuator.clone()) {
+                    return Err(SettingsError::Twice { at, actuator });
+                }
+            }
+            driver.check_lines(at)?;
+        }
+        let mut names = BTreeSet::new();
+        for (at, hook) in self.estop.iter().enumerate() {
+            if hook.file.is_some() == hook.gpio.is_some() {
+                return Err(SettingsError::HookWay(at));
+            }
+            if hook.name.is_empty() || !names.insert(&hook.name) {
+                return Err(SettingsError::HookName { at, name: hook.name.clone() });
+            }
+            if hook.tier == Tier::None {
+                return Err(SettingsError::HookTier(at));
+            }
+        }
+        Ok(())
+    }
+
+    /// What the core decides by.
+    pub(super) fn core(&self) -> gate::Settings {
+        let millis = |span: Span| u64::try_from(span.as_duration().as_millis()).unwrap_or(u64::MAX);
+        let step = |rung: &Rung| Step { after_ms: millis(rung.after), action: rung.action };
+        gate::Settings {
+            ladder: match &self.ladder {
+                Some(rungs) => rungs.iter().map(step).collect(),
+                None => gate::DEFAULT_LADDER.to_vec(),
+            },
+            agent_grace_ms: millis(self.agent_grace),
+        }
+    }
+}
+
+impl Driver {
+    fn check_lines(&self, at: usize) -> Result<(), SettingsError> {
+        let commands =
+            [("stop", Some(&self.stop)), ("hold", self.hold.as_ref()), ("cut", self.cut.as_ref())];
+        let torn = |(_, text): &(_, Option<&String>)| text.is_some_and(|text| text.contains('\n'));
+        match commands.into_iter().find(torn) {
+            Some((field, _)) if self.framing == Framing::Lines => {
+                Err(SettingsError::Newline { at, field })
+            }
+            _ => Ok(()),
+        }
+    }
+}
+
+impl Hook {
+    /// What is looked at.
+    pub(super) fn path(&self) -> &Path {
+        self.file.as_deref().or(self.gpio.as_deref()).unwrap_or_else(|| Path::new(""))
+    }
+
+    /// What it demands, from what was read.
+    pub(super) fn demands(&self, read: &std::io::Result<String>) -> Tier {
+        match (self.file.is_some(), read) {
+            (true, Ok(text)) => match text.trim().to_ascii_lowercase().as_str() {
+                "none" => Tier::None,
+                "cut" => Tier::Cut,
+                _ => Tier::Settle,
+            },
+            (true, Err(error)) if error.kind() == std::io::ErrorKind::NotFound => Tier::None,
+            (true, Err(_)) => Tier::Settle,
+            (false, Ok(text)) if text.trim() == if self.active_low { "1" } else { "0" } => {
+                Tier::None
+            }
+            (false, _) => self.tier,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn settings(text: &str) -> Settings {
+        serde_saphyr::from_str(text).unwrap()
+    }
+
+    fn refusal(text: &str) -> String {
+        let actuators = ["base:Drive", "arm:Move"].map(|name| name.parse().unwrap());
+        settings(text).check(&BTreeSet::from(actuators)).unwrap_err().to_string()
+    }
+
+    #[test]
+    fn what_makes_no_sense_is_named() {
+        let cases = [
+            ("drivers: [{actuators: ['base:Drive'], stop: s}]", "drivers[0]: give exactly one"),
+            ("drivers: [{actuators: [], exec: [a], stop: s}]", "drivers[0].actuators: name what"),
+            ("drivers: [{actuators: ['leg:Kick'], exec: [a], stop: s}]", "add it to --ar-res"),
+            (
+                "drivers: [{actuators: ['base:Drive'], exec: [a], stop: s}, {actuators: ['base:Drive'], unix: /a, stop: s}]",
+                "drivers[1].actuators: base:Drive has a driver already",
+            ),
+            (
+                "drivers: [{actuators: ['base:Drive'], exec: [a], stop: \"a\\nb\"}]",
+                "drivers[0].stop",
+            ),
+            ("estop: [{name: a}]", "estop[0]: give exactly one"),
+            ("estop: [{name: a, file: /a}, {name: a, gpio: /b}]", "estop[1].name: \"a\" is taken"),
+            ("estop: [{name: a, gpio: /b, tier: None}]", "estop[0].tier"),
+        ];
+        for (text, part) in cases {
+            let refusal = refusal(text);
+            assert!(refusal.contains(part), "{text}: {refusal}");
+        }
+    }
+
+    #[test]
+    fn what_cannot_be_read_stops_the_robot() {
+        let gone = || Err(std::io::ErrorKind::NotFound.into());
+        let io = || Err(std::io::ErrorKind::PermissionDenied.into());
+        let text = |text: &str| Ok(text.to_owned());
+        let all = settings(
+            "estop: [{name: f, file: /f}, {name: g, gpio: /g}, {name: l, gpio: /l, activeLow: true}]",
+        );
+        let [file, pin, low] = all.estop.as_slice() else { panic!() };
+        for (read, tier) in [
+            (gone(), Tier::None),
+            (io(), Tier::Settle),
+            (text("none\n"), Tier::None),
+            (text("Cut"), Tier::Cut),
+            (text("settle"), Tier::Settle),
+            (text("what"), Tier::Settle),
+        ] {
+            assert_eq!(file.demands(&read), tier, "{read:?}");
+        }
+        for (read, pressed, pressed_low) in [
+            (text("0\n"), Tier::None, Tier::Cut),
+            (text("1\n"), Tier::Cut, Tier::None),
+            (gone(), Tier::Cut, Tier::Cut),
+            (text(""), Tier::Cut, Tier::Cut),
+        ] {
+            assert_eq!(
+                (pin.demands(&read), low.demands(&read)),
+                (pressed, pressed_low),
+                "{read:?}"
+            );
+        }
+    }
+}
