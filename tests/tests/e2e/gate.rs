@@ -20,7 +20,7 @@ impl Robot {
     async fn join(cluster: &mut Cluster) -> Robot {
         let (heard, config) = (cluster.dir().join("heard"), cluster.dir().join("agent.yaml"));
         let gate = json!({"gate": {"drivers": [{
-            "actuators": ["base:Drive"],
+            "actuators": ["base:Drive", "arm:Grasp"],
             "exec": ["sh", "-c", format!("exec cat >> {}", heard.display())],
             "stop": "stop",
         }]}});
