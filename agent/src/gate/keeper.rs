@@ -19,6 +19,7 @@ use muster_api::name::FunctionName;
 use muster_api::wire::gate::v1 as proto;
 use tokio::net::UnixStream;
 use tokio::sync::watch;
+use tokio::time::Instant;
 
 use super::settings::{self, Settings};
 use super::{AGENT_SOCKET, TASKS_DIR, VERB};
@@ -216,12 +217,17 @@ impl Keeper {
 
     /// Keeps a gate until dropped; the gate stays.
     pub(crate) async fn run(self: Arc<Keeper>) {
-        let mut child: Option<Child> = None;
+        let mut child: Option<(Child, Instant)> = None;
         loop {
-            // A gate that has ended must not stay a zombie.
-            if child.as_mut().is_some_and(|child| matches!(child.try_wait(), Ok(Some(_)))) {
+            // A gate that has ended must not stay a zombie. One that ran is started again at once: the robot stands only when
+            // the next one has said so.
+            if let Some((gate, started)) = &mut child
+                && matches!(gate.try_wait(), Ok(Some(_)))
+            {
+                if started.elapsed() < START_AGAIN {
+                    tokio::time::sleep(START_AGAIN).await;
+                }
                 child = None;
-                tokio::time::sleep(START_AGAIN).await;
             }
             match UnixStream::connect(self.dir.join(AGENT_SOCKET)).await {
                 Ok(stream) => {
@@ -231,7 +237,7 @@ impl Keeper {
                     tracing::warn!(error, "the gate is gone: the robot stands");
                 }
                 Err(_) if child.is_none() => match self.start() {
-                    Ok(started) => child = Some(started),
+                    Ok(started) => child = Some((started, Instant::now())),
                     Err(error) => {
                         tracing::error!(error = chain(&error), "the gate does not start");
                         tokio::time::sleep(START_AGAIN).await;

@@ -11,6 +11,7 @@ mod messages;
 mod placement;
 mod poses;
 mod stats;
+mod stops;
 mod submit;
 mod writes;
 
@@ -41,6 +42,9 @@ const FIGURES: &[Figure] = &[
     }),
     ("poses", "poses of 10 000 robots over 100 streams on one core, against a bare stream", || {
         Box::pin(poses::all())
+    }),
+    ("stops", "from what should stop a robot until its driver reads the stop", || {
+        Box::pin(stops::all())
     }),
     ("footprint", "RSS and idle CPU of agent and controller", || Box::pin(footprint::all())),
 ];
