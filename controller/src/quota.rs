@@ -16,7 +16,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use muster_api::id::TaskUid;
 use muster_api::kind::quota::{QUOTA_NAME, Quota, QuotaSpec, TaskDefaults, Used};
-use muster_api::kind::task::Resources;
+use muster_api::kind::task::{Resources, Task};
 use muster_api::phase::TaskPhase;
 use muster_api::validate::Violations;
 use muster_controller_core::quota::{Requests, asked, refusals};
@@ -82,13 +82,19 @@ struct SeenStatus {
     phase: TaskPhase,
 }
 
+fn is_tried_again(stored: &Stored) -> bool {
+    let may_be = stored.mentions("reschedule") || stored.mentions("onOutOfRange");
+    may_be && objects::read::<Task>(stored).is_some_and(|task| !task.outlook().is_over())
+}
+
 impl Counted {
     fn take_in(&mut self, change: Change, stored: &Stored) {
         let uid = TaskUid::new(&*stored.uid);
         self.passing.remove(&uid);
         let seen = (change == Change::Put).then(|| objects::read::<Seen>(stored)).flatten();
         match seen {
-            Some(task) if !task.status.phase.is_terminal() => {
+            // One that is about to be tried elsewhere asks for the same then.
+            Some(task) if !task.status.phase.is_terminal() || is_tried_again(stored) => {
                 self.present.put(&uid, asked(&task.spec.resources));
             }
             _ => self.present.remove(&uid),

@@ -147,6 +147,9 @@ pub struct Workload {
     pub restarts: u32,
     /// Failures in a row.
     pub failures: u32,
+    /// Attempts that failed, of all that there were.
+    #[serde(default)]
+    pub failed: u32,
     /// What its probes have found of the current attempt.
     #[serde(default)]
     pub verdicts: Verdicts,
@@ -207,6 +210,7 @@ impl Workload {
             unused: false,
             restarts: 0,
             failures: 0,
+            failed: 0,
             verdicts: Verdicts::default(),
             condemned: None,
             standing: None,
@@ -484,8 +488,14 @@ impl Workload {
         } else if self.failures > 0 {
             // A launch that dies before it says anything may do so every time: not in a tight loop.
             self.unused = true;
+            self.failed = self.failed.saturating_add(1);
             let reason = Reason::Runtime("LaunchUnclear".to_owned());
-            self.wait(reason, "its launch ended without an answer", context, effects);
+            let message = "its launch ended without an answer";
+            if self.is_given_up() {
+                self.ended_unable(reason, message, context);
+            } else {
+                self.wait(reason, message, context, effects);
+            }
         } else if self.in_contact(context) && self.desired.depends.is_empty() {
             // The same number: nothing of it ever ran.
             self.launch(effects);
@@ -500,19 +510,31 @@ impl Workload {
         let reason = Reason::Runtime(failure.reason.clone());
         self.unused = true;
         if self.forgotten || self.desired.stop.is_some() {
-            self.ended_unstarted(context, effects);
-        } else if failure.retry {
+            return self.ended_unstarted(context, effects);
+        }
+        self.failed = self.failed.saturating_add(1);
+        if failure.retry && !self.is_given_up() {
             self.failures = self.failures.saturating_add(1);
             self.wait(reason, &failure.message, context, effects);
         } else {
-            self.state = State::Ended;
-            let mut content = self.report_draft();
-            content.phase = Phase::Failed;
-            content.finished_at = Some(context.now.wall);
-            content.reason = reason;
-            content.message.clone_from(&failure.message);
-            self.report.update(content);
+            self.ended_unable(reason, &failure.message, context);
         }
+    }
+
+    /// As many attempts have failed here as may.
+    fn is_given_up(&self) -> bool {
+        self.desired.attempts.is_some_and(|attempts| self.failed >= attempts)
+    }
+
+    /// The end of a task that could not be started.
+    fn ended_unable(&mut self, reason: Reason, message: &str, context: Context) {
+        self.state = State::Ended;
+        let mut content = self.report_draft();
+        content.phase = Phase::Failed;
+        content.finished_at = Some(context.now.wall);
+        content.reason = reason;
+        message.clone_into(&mut content.message);
+        self.report.update(content);
     }
 
     fn on_exit(&mut self, exit: &Exit, context: Context, effects: &mut Vec<Effect>) {
@@ -537,6 +559,8 @@ impl Workload {
         if let Some(failed) = self.condemned_for().filter(|_| by_itself) {
             (content.reason, content.message) = failed;
         }
+        self.count_failure(exit);
+        content.failed_attempts = self.failed;
         let again = self.runs_again(exit);
         let condemned = self.condemned.take();
         let follows = matches!(condemned, Some(Condemned::Dependency { .. }));
@@ -645,6 +669,7 @@ impl Workload {
         let mut content = self.report.content.clone();
         content.attempt = self.attempt;
         content.restarts = self.restarts;
+        content.failed_attempts = self.failed;
         content
     }
 

@@ -16,6 +16,7 @@ use crate::error::CliError;
 use crate::exit;
 use crate::output::objects::full_name;
 use crate::session::Session;
+use crate::successor;
 use crate::target::{self, Named};
 use crate::watch::{Change, Follow, merged};
 
@@ -279,22 +280,27 @@ async fn until_holds(args: &Args, objects: Vec<Doomed>, session: &mut Session) -
             Change::Deleted(object) => (object, true),
             Change::Synced => continue,
         };
-        let uid = object.pointer("/metadata/uid").and_then(Value::as_str).unwrap_or_default();
-        let Some(awaited) = left.get_mut(uid) else { continue };
+        if successor::is_tried_again(&object) {
+            // The next object of its name is waited for.
+            continue;
+        }
+        let Some((uid, before)) = successor::claim(&mut left, &object) else { continue };
+        before.iter().for_each(|before| progress.drop_row(before));
+        let Some(awaited) = left.get_mut(&uid) else { continue };
         let title = full_name(awaited.info, &object);
         if gone || wanted.is_hopeless(awaited.info, &object) {
             progress.end(false);
             return Err(ended(&title, &object, gone, wanted));
         }
         if wanted.holds(awaited.info, &object) {
-            progress.drop_row(uid);
-            left.remove(uid);
+            progress.drop_row(&uid);
+            left.remove(&uid);
             session.ui.line(&format!("{title} is {}", wanted.text()))?;
             continue;
         }
         let phase = object.pointer("/status/phase").and_then(Value::as_str);
         let now = phase.map(|p| format!(" (now {p})")).unwrap_or_default();
-        progress.show(uid, &format!("{title} is not yet {}{now}", wanted.text()));
+        progress.show(&uid, &format!("{title} is not yet {}{now}", wanted.text()));
         awaited.object = object;
     }
     progress.end(false);

@@ -22,6 +22,7 @@
 //! | [`hold`] | why a task is not considered for a place at all |
 //! | [`config`] | what a task gets of ConfigMaps and Secrets |
 //! | [`deadline`] | when a task has been on its node, or has been over, for long enough |
+//! | [`reschedule`] | whether a task that failed is tried on another node, and when |
 //! | [`deletion`] | when an object is to be gone that somebody deletes |
 //! | [`recent`] | one allocation for what many nodes or tasks have in common |
 //! | [`node_health`] | when a node counts as lost |
@@ -47,6 +48,7 @@ pub mod preempt;
 pub mod quota;
 pub mod recent;
 pub mod report;
+pub mod reschedule;
 pub mod schedule;
 pub mod space;
 pub mod stray;

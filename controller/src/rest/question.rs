@@ -74,6 +74,7 @@ pub(super) async fn why(call: Call, target: Object) -> Answer {
             title: title.into(),
             spec: Arc::new(task.spec),
             since: 0,
+            avoid: Arc::default(),
         };
         scheduler.why(demand).await.map_err(ended)?
     } else {
@@ -212,6 +213,7 @@ fn demand(index: usize, object: &Value) -> Result<Demand, Failure> {
         spec: Arc::new(task.spec),
         // After everything that waits.
         since: u64::MAX / 2 + index as u64,
+        avoid: Arc::default(),
     })
 }
 

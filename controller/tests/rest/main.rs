@@ -11,5 +11,6 @@ mod objects;
 mod poses;
 mod quotas;
 mod removal;
+mod reschedule;
 mod support;
 mod watching;

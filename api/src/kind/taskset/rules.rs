@@ -98,6 +98,14 @@ fn template_rules(spec: &TaskSetSpec, violations: &mut Violations) {
             )
             .suggest("leave it out, or set Always; what should end once is a Task");
     }
+    if template.reschedule.is_some() {
+        violations
+            .forbidden(
+                "spec.template.spec.reschedule",
+                "a TaskSet puts another task in the place of one that has ended, itself",
+            )
+            .suggest("leave it out");
+    }
     let placement = &template.placement;
     if placement.prefer.is_some() {
         violations
