@@ -301,13 +301,20 @@ impl Workload {
     }
 
     fn on_assigned(&mut self, desired: Desired, context: Context, effects: &mut Vec<Effect>) {
-        let sooner = match (&self.desired.stop, &desired.stop) {
+        let before = self.desired.stop.take();
+        let sooner = match (&before, &desired.stop) {
             (Some(old), Some(new)) => new.grace_ms < old.grace_ms,
             (None, Some(_)) => true,
             (_, None) => false,
         };
-        // An order to stop is never taken back: part of the task may be gone already.
-        let stop = desired.stop.clone().or_else(|| self.desired.stop.clone());
+        // An order to stop is never taken back, nor given more time: part of the task may be gone already, and whoever
+        // waits for its end was told when that is.
+        let mut stop = if sooner { desired.stop.clone() } else { before };
+        if matches!(self.state, State::Stopping { .. }) && self.condemned.is_some() {
+            // It was being ended already, with the grace that it has itself.
+            let grace_ms = self.desired.grace_ms;
+            stop.iter_mut().for_each(|order| order.grace_ms = order.grace_ms.min(grace_ms));
+        }
         self.desired = Desired { stop, ..desired };
         if sooner {
             self.end_if_wanted(context, effects);

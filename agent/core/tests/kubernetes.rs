@@ -11,7 +11,7 @@ use muster_agent_core::report::Phase;
 use muster_agent_core::restart::{delay_ms, failures_after};
 use muster_agent_core::time::{Boot, Now, Wall};
 use muster_agent_core::workload::{
-    Context, Effect, Event, Failure, Fetch, Outcome, Response, Workload,
+    Context, Effect, Event, Failure, Fetch, Outcome, Response, STOP_AGAIN_MS, Workload,
 };
 use muster_api::id::TaskUid;
 use table::{Differs, Muster, Row, Same, hold};
@@ -216,6 +216,31 @@ fn grace_gets_shorter_never_longer() {
         let mut task = running(Never);
         let told = orders.iter().map(|grace| order(&mut task, *grace));
         &*told.collect::<Vec<_>>().leak()
+    });
+}
+
+/// The same orders, and the grace (ms) that its processes are told when the last one has not ended them and is repeated: a
+/// later delete may only shorten what is under way (`DeletionGracePeriodSeconds`).
+#[test]
+fn a_repeated_order_has_the_shortest_grace() {
+    let rows: &[Row<&[Option<u64>], u64>] = &[
+        (&[Some(10_000)], 10_000, Same),
+        (&[Some(10_000), Some(60_000)], 10_000, Same),
+        (&[Some(10_000), Some(5_000), Some(7_000)], 5_000, Same),
+        (&[Some(60_000), Some(10_000), None], 10_000, Same),
+        (&[Some(5_000), Some(0), Some(60_000)], 0, Same),
+    ];
+    hold(rows, |orders| {
+        let mut task = running(Never);
+        for grace in orders.iter() {
+            let _ = order(&mut task, *grace);
+        }
+        let repeated = task.handle(Event::Tick, context(SHORT + MINUTE + STOP_AGAIN_MS));
+        let grace = |effect: &Effect| match effect {
+            Effect::Stop { grace_ms, .. } => Some(*grace_ms),
+            _ => None,
+        };
+        repeated.effects.iter().find_map(grace).expect("it is told again")
     });
 }
 

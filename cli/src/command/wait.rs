@@ -417,6 +417,35 @@ mod tests {
         assert!(error.to_string().contains("ended as Failed"), "{error}");
     }
 
+    #[tokio::test]
+    async fn a_task_that_is_tried_elsewhere_is_waited_for_under_its_next_uid() {
+        let fake = Fake::new();
+        let put = |uid: &str, status: Value| {
+            let mut object = task("a", status);
+            object["metadata"]["uid"] = uid.into();
+            object["spec"]["reschedule"] = json!({"maxAttempts": 2});
+            fake.put("tasks/default/a", object);
+        };
+        let failed = |used: u32, earlier: Value| json!({"phase": "Failed", "node": "n", "reason": "Error", "attemptsUsed": used, "earlier": earlier});
+        let earlier = json!([{"uid": "one", "node": "n", "attempts": 1}]);
+        for (end, code) in [("Succeeded", exit::OK), ("Failed", exit::TASK_ENDED)] {
+            put("one", json!({"phase": "Running", "node": "n"}));
+            let wait = fake.try_run(&["wait", "task/a", "--for=phase=Succeeded"]);
+            let (done, ()) = tokio::join!(wait, async {
+                tokio::time::sleep(std::time::Duration::from_millis(30)).await;
+                put("one", failed(0, json!([])));
+                fake.remove("tasks/default/a");
+                put("two", json!({"phase": "Pending", "attemptsUsed": 1, "earlier": earlier}));
+                let mut status = failed(1, earlier.clone());
+                status["phase"] = end.into();
+                put("two", status);
+            });
+            let came = done.map_or_else(|error| error.class().exit(), |(code, _)| code);
+            assert_eq!(came, code, "{end}");
+            fake.remove("tasks/default/a");
+        }
+    }
+
     #[test]
     fn a_task_is_ready_when_it_runs_and_its_probes_say_so() {
         let task = muster_api::kind::find_by_word("task").expect("served");

@@ -123,7 +123,7 @@ pub(super) async fn plan(call: Call) -> Answer {
 }
 
 /// A task that would be created, with what its namespace's quota fills in; anything else as it is.
-fn with_defaults(context: &Context, object: &Value) -> Value {
+pub(super) fn with_defaults(context: &Context, object: &Value) -> Value {
     let mut object = object.clone();
     let text = |pointer: &str| object.pointer(pointer).and_then(Value::as_str);
     let namespace = text("/metadata/namespace").unwrap_or(DEFAULT).to_owned();

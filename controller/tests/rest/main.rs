@@ -10,6 +10,7 @@ mod fleet;
 mod objects;
 mod poses;
 mod quotas;
+mod radius;
 mod removal;
 mod reschedule;
 mod support;
