@@ -82,6 +82,7 @@ pub(crate) fn desired(spec: &TaskSpec, stop: Option<StopOrder>) -> Desired {
             .map(|span| u64::try_from(span.as_duration().as_millis()).unwrap_or(u64::MAX)),
         probes: probe::probes(spec),
         depends: Vec::new(),
+        attempts: None,
         stop,
     }
 }

@@ -192,7 +192,8 @@ fn decode(message: proto::Assignments, known: &BTreeMap<TaskUid, Task>) -> (Assi
                 continue;
             }
         };
-        let desired = Desired { depends, ..spec::desired(&task_spec, stop) };
+        let attempts = Some(wire.attempts).filter(|attempts| *attempts > 0);
+        let desired = Desired { depends, attempts, ..spec::desired(&task_spec, stop) };
         assignments.upserts.insert(uid.clone(), desired);
         details.insert(uid, assignment(task_spec));
     }

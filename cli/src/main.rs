@@ -3,7 +3,7 @@
 //! | module | holds |
 //! |---|---|
 //! | [`args`], [`target`] | the command line; which objects its words name |
-//! | [`config`], [`client`], [`watch`] | kubeconfig; REST; following a collection |
+//! | [`config`], [`client`], [`watch`], [`successor`] | kubeconfig; REST; following a collection, and a task over its uids |
 //! | [`manifests`], [`merge`] | files → checked objects; three-way merge |
 //! | [`command`] | one file a verb |
 //! | [`output`] | tables, sheets, progress |
@@ -22,6 +22,7 @@ mod manifests;
 mod merge;
 mod output;
 mod session;
+mod successor;
 mod target;
 mod watch;
 

@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 
 use muster_api::kind::task::depend::{self, DependencyCondition, Graph};
-use muster_api::kind::task::{Task, TaskSpec, TaskStatus};
+use muster_api::kind::task::{Outlook, Task, TaskSpec, TaskStatus};
 use muster_api::validate::Violations;
 use muster_api::wire::agent::v1 as wire;
 use muster_controller_core::hold::Hold;
@@ -33,8 +33,7 @@ pub(crate) fn holds(store: &Store, namespace: &str, spec: &TaskSpec) -> Vec<Hold
         let Some(task) = task(store, namespace, &name) else {
             return Some(Hold::DependencyNotFound { task: name });
         };
-        let TaskStatus { phase, ready, .. } = task.status.unwrap_or_default();
-        let why = one.condition.unmet(phase, ready)?;
+        let why = unmet(one.condition, &task)?;
         Some(Hold::DependencyNotMet { task: name, why })
     };
     spec.depends_on.iter().filter_map(hold).collect()
@@ -77,11 +76,10 @@ pub(crate) fn to_wire(store: &Store, namespace: &str, spec: &TaskSpec) -> Vec<wi
                 told.unmet = "is not there".to_owned();
             }
             Some(task) => {
-                let status = task.status.unwrap_or_default();
-                told.uid = task.metadata.uid.unwrap_or_default();
-                told.attempt = status.attempt;
-                let unmet = one.condition.unmet(status.phase, status.ready);
+                let unmet = unmet(one.condition, &task);
                 (told.met, told.unmet) = (unmet.is_none(), unmet.unwrap_or_default());
+                told.uid = task.metadata.uid.unwrap_or_default();
+                told.attempt = task.status.unwrap_or_default().attempt;
             }
         }
         told
@@ -89,9 +87,18 @@ pub(crate) fn to_wire(store: &Store, namespace: &str, spec: &TaskSpec) -> Vec<wi
     spec.depends_on.iter().map(dependency).collect()
 }
 
-fn has_ended(task: &Value) -> bool {
-    let phase = task["status"]["phase"].as_str();
-    phase.is_some_and(|phase| phase == "Succeeded" || phase == "Failed")
+/// What a task that others wait for lacks, a clause whose subject is that task.
+fn unmet(condition: DependencyCondition, task: &Task) -> Option<String> {
+    if let Outlook::Again { .. } = task.outlook() {
+        return Some("has failed on its node and is about to be tried again".to_owned());
+    }
+    let TaskStatus { phase, ready, .. } = task.status.clone().unwrap_or_default();
+    condition.unmet(phase, ready)
+}
+
+/// Whether nothing will run again under its name by itself.
+fn is_over(task: &Value) -> bool {
+    serde_json::from_value::<Task>(task.clone()).is_ok_and(|task| task.outlook().is_over())
 }
 
 /// Refuses a new task that would wait for itself.
@@ -114,7 +121,7 @@ pub(crate) fn check(store: &Store, object: &Value) -> Result<(), Violations> {
         }
         let stored = store.get(&key_of(namespace, &next)).filter(|s| s.mentions("dependsOn"));
         // What has ended waits for nobody.
-        let value = stored.map(|stored| stored.value()).filter(|task| !has_ended(task));
+        let value = stored.map(|stored| stored.value()).filter(|task| !is_over(task));
         let more = value.as_ref().map(depend::named).unwrap_or_default();
         left.extend(more.iter().cloned());
         graph.insert(next, more);

@@ -7,7 +7,7 @@ use std::sync::Arc;
 
 use muster_api::kind::lease::{Lease, LeaseSpec};
 use muster_api::kind::namespace::DEFAULT;
-use muster_api::kind::node::Node;
+use muster_api::kind::node::{MissionLock, Node};
 use muster_api::kind::task::Task;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
@@ -114,6 +114,30 @@ pub fn release_lease(store: &Store, name: &str, uid: &str) -> Option<Op> {
     status.holder = None;
     status.acquired = None;
     Some(replace(&stored, &lease))
+}
+
+/// Why nobody may end what runs on a node.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Locked {
+    /// A mission lock says so.
+    By(MissionLock),
+    /// There is no such Node.
+    Gone,
+}
+
+/// A condition of the orders that end tasks on a node: that it has no mission lock at the moment of the commit.
+///
+/// # Errors
+///
+/// What stands against it now.
+pub fn unlocked(store: &Store, node: &str) -> Result<Op, Locked> {
+    let key = node_key(node);
+    let stored = store.get(&key).ok_or(Locked::Gone)?;
+    let object: Node = read(&stored).ok_or(Locked::Gone)?;
+    match object.mission_lock() {
+        Some(lock) => Err(Locked::By(lock)),
+        None => Ok(Op::Check { key, precondition: Precondition::revision(stored.revision) }),
+    }
 }
 
 /// The tasks that hold resources of a node, in the order of their names.

@@ -16,7 +16,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use muster_api::id::TaskUid;
 use muster_api::kind::quota::{QUOTA_NAME, Quota, QuotaSpec, TaskDefaults, Used};
-use muster_api::kind::task::Resources;
+use muster_api::kind::task::{Resources, Task};
 use muster_api::phase::TaskPhase;
 use muster_api::validate::Violations;
 use muster_controller_core::quota::{Requests, asked, refusals};
@@ -82,13 +82,19 @@ struct SeenStatus {
     phase: TaskPhase,
 }
 
+fn is_tried_again(stored: &Stored) -> bool {
+    let may_be = stored.mentions("reschedule") || stored.mentions("onOutOfRange");
+    may_be && objects::read::<Task>(stored).is_some_and(|task| !task.outlook().is_over())
+}
+
 impl Counted {
     fn take_in(&mut self, change: Change, stored: &Stored) {
         let uid = TaskUid::new(&*stored.uid);
         self.passing.remove(&uid);
         let seen = (change == Change::Put).then(|| objects::read::<Seen>(stored)).flatten();
         match seen {
-            Some(task) if !task.status.phase.is_terminal() => {
+            // One that is about to be tried elsewhere asks for the same then.
+            Some(task) if !task.status.phase.is_terminal() || is_tried_again(stored) => {
                 self.present.put(&uid, asked(&task.spec.resources));
             }
             _ => self.present.remove(&uid),
@@ -159,6 +165,23 @@ pub(crate) fn of(store: &Store, namespace: &str) -> Option<QuotaSpec> {
     objects::read::<Quota>(&stored).map(|quota| quota.spec)
 }
 
+/// Whether what a task asks for is left when tasks ask for `used`, and `with` that come with it for more.
+fn judge(quota: &QuotaSpec, used: &Used, asked: &Used, with: Used) -> Result<(), Violations> {
+    let mut sum = used.clone();
+    sum.add(&with);
+    let alone = refusals(quota, used, asked);
+    let mut violations = Violations::new();
+    for refusal in refusals(quota, &sum, asked) {
+        let together = alone.iter().all(|other| other.field != refusal.field);
+        violations.forbidden(&refusal.field, refusal.to_string()).suggest(if together {
+            "alone it would pass: apply fewer at once, end other tasks first, or have the Quota \"default\" raised"
+        } else {
+            "end other tasks first, or have the Quota \"default\" raised"
+        });
+    }
+    if violations.is_empty() { Ok(()) } else { Err(violations) }
+}
+
 impl Door {
     /// Lets a new task in, or says everything that its namespace's quota does not leave. None: no quota.
     pub(crate) fn admit(
@@ -176,18 +199,31 @@ impl Door {
         };
         let (uid, asked) = (TaskUid::new(uid), asked(resources));
         let counted = counts.of(store, namespace);
-        let mut violations = Violations::new();
-        for refusal in refusals(&quota, &counted.sum(), &asked) {
-            violations
-                .forbidden(&refusal.field, refusal.to_string())
-                .suggest("end other tasks first, or have the Quota \"default\" raised");
-        }
-        if !violations.is_empty() {
-            return Err(violations);
-        }
+        judge(&quota, &counted.sum(), &asked, Used::default())?;
         counted.passing.put(&uid, asked);
         drop(counts);
         Ok(Some(Pass { door: Arc::clone(self), namespace: namespace.into(), uid }))
+    }
+
+    /// Whether new tasks of a namespace would be let in one after the other, under `quota`. Nobody is let in: who asks
+    /// beside this finds what there was before.
+    pub(crate) fn rehearse<'a>(
+        &self,
+        store: &Store,
+        (namespace, quota): (&str, &QuotaSpec),
+        tasks: impl IntoIterator<Item = &'a Resources>,
+    ) -> Vec<Result<(), Violations>> {
+        let present = self.requested(store, namespace);
+        let mut before = Used::default();
+        let ask = |resources: &Resources| {
+            let asked = asked(resources);
+            let judged = judge(quota, &present, &asked, before.clone());
+            if judged.is_ok() {
+                before.add(&asked);
+            }
+            judged
+        };
+        tasks.into_iter().map(ask).collect()
     }
 
     /// What the tasks of a namespace ask for that have not ended.

@@ -50,6 +50,9 @@ pub struct Desired {
     /// Tasks that must have come so far before an attempt begins.
     #[serde(default)]
     pub depends: Vec<Dependency>,
+    /// Present: so many attempts may fail here, and the last of them is its end, whatever `restart` says.
+    #[serde(default)]
+    pub attempts: Option<u32>,
     /// Present: it must end.
     pub stop: Option<StopOrder>,
 }
@@ -59,6 +62,14 @@ impl Desired {
     #[must_use]
     pub fn once(grace_ms: u64) -> Desired {
         let (restart, probes) = (RestartPolicy::Never, Probes::default());
-        Desired { restart, grace_ms, stop_after_ms: None, probes, depends: Vec::new(), stop: None }
+        Desired {
+            restart,
+            grace_ms,
+            stop_after_ms: None,
+            probes,
+            depends: Vec::new(),
+            attempts: None,
+            stop: None,
+        }
     }
 }

@@ -162,6 +162,9 @@ pub struct Content {
     /// Whether its probes say that it serves, true only while it runs; none of them says that: `None`.
     #[serde(default)]
     pub ready: Option<bool>,
+    /// How many attempts have failed here.
+    #[serde(default)]
+    pub failed_attempts: u32,
 }
 
 /// A numbered report.
@@ -190,6 +193,7 @@ impl Report {
                 started_at: None,
                 finished_at: None,
                 ready: None,
+                failed_attempts: 0,
             },
         }
     }

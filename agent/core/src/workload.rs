@@ -11,6 +11,7 @@
 //! launch begins, and a number is used again only when a runtime has said that nothing of it was
 //! ever started.
 
+mod failed;
 mod probed;
 mod waited;
 
@@ -147,6 +148,9 @@ pub struct Workload {
     pub restarts: u32,
     /// Failures in a row.
     pub failures: u32,
+    /// Attempts that failed, of all that there were.
+    #[serde(default)]
+    pub failed: u32,
     /// What its probes have found of the current attempt.
     #[serde(default)]
     pub verdicts: Verdicts,
@@ -207,6 +211,7 @@ impl Workload {
             unused: false,
             restarts: 0,
             failures: 0,
+            failed: 0,
             verdicts: Verdicts::default(),
             condemned: None,
             standing: None,
@@ -297,13 +302,20 @@ impl Workload {
     }
 
     fn on_assigned(&mut self, desired: Desired, context: Context, effects: &mut Vec<Effect>) {
-        let sooner = match (&self.desired.stop, &desired.stop) {
+        let before = self.desired.stop.take();
+        let sooner = match (&before, &desired.stop) {
             (Some(old), Some(new)) => new.grace_ms < old.grace_ms,
             (None, Some(_)) => true,
             (_, None) => false,
         };
-        // An order to stop is never taken back: part of the task may be gone already.
-        let stop = desired.stop.clone().or_else(|| self.desired.stop.clone());
+        // An order to stop is never taken back, nor given more time: part of the task may be gone already, and whoever
+        // waits for its end was told when that is.
+        let mut stop = if sooner { desired.stop.clone() } else { before };
+        if matches!(self.state, State::Stopping { .. }) && self.condemned.is_some() {
+            // It was being ended already, with the grace that it has itself.
+            let grace_ms = self.desired.grace_ms;
+            stop.iter_mut().for_each(|order| order.grace_ms = order.grace_ms.min(grace_ms));
+        }
         self.desired = Desired { stop, ..desired };
         if sooner {
             self.end_if_wanted(context, effects);
@@ -484,8 +496,14 @@ impl Workload {
         } else if self.failures > 0 {
             // A launch that dies before it says anything may do so every time: not in a tight loop.
             self.unused = true;
+            self.failed = self.failed.saturating_add(1);
             let reason = Reason::Runtime("LaunchUnclear".to_owned());
-            self.wait(reason, "its launch ended without an answer", context, effects);
+            let message = "its launch ended without an answer";
+            if self.is_given_up() {
+                self.ended_unable(reason, message, context);
+            } else {
+                self.wait(reason, message, context, effects);
+            }
         } else if self.in_contact(context) && self.desired.depends.is_empty() {
             // The same number: nothing of it ever ran.
             self.launch(effects);
@@ -493,25 +511,6 @@ impl Workload {
             self.unused = true;
             self.state = State::Waiting { until: context.now.boot };
             self.move_on(context, effects);
-        }
-    }
-
-    fn on_failure(&mut self, failure: &Failure, context: Context, effects: &mut Vec<Effect>) {
-        let reason = Reason::Runtime(failure.reason.clone());
-        self.unused = true;
-        if self.forgotten || self.desired.stop.is_some() {
-            self.ended_unstarted(context, effects);
-        } else if failure.retry {
-            self.failures = self.failures.saturating_add(1);
-            self.wait(reason, &failure.message, context, effects);
-        } else {
-            self.state = State::Ended;
-            let mut content = self.report_draft();
-            content.phase = Phase::Failed;
-            content.finished_at = Some(context.now.wall);
-            content.reason = reason;
-            content.message.clone_from(&failure.message);
-            self.report.update(content);
         }
     }
 
@@ -537,6 +536,8 @@ impl Workload {
         if let Some(failed) = self.condemned_for().filter(|_| by_itself) {
             (content.reason, content.message) = failed;
         }
+        self.count_failure(exit);
+        content.failed_attempts = self.failed;
         let again = self.runs_again(exit);
         let condemned = self.condemned.take();
         let follows = matches!(condemned, Some(Condemned::Dependency { .. }));
@@ -645,6 +646,7 @@ impl Workload {
         let mut content = self.report.content.clone();
         content.attempt = self.attempt;
         content.restarts = self.restarts;
+        content.failed_attempts = self.failed;
         content
     }
 

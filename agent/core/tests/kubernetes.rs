@@ -10,7 +10,9 @@ use muster_agent_core::observed::{End, Exit, Loss, Started};
 use muster_agent_core::report::Phase;
 use muster_agent_core::restart::{delay_ms, failures_after};
 use muster_agent_core::time::{Boot, Now, Wall};
-use muster_agent_core::workload::{Context, Effect, Event, Fetch, Outcome, Response, Workload};
+use muster_agent_core::workload::{
+    Context, Effect, Event, Failure, Fetch, Outcome, Response, STOP_AGAIN_MS, Workload,
+};
 use muster_api::id::TaskUid;
 use table::{Differs, Muster, Row, Same, hold};
 
@@ -217,6 +219,31 @@ fn grace_gets_shorter_never_longer() {
     });
 }
 
+/// The same orders, and the grace (ms) that its processes are told when the last one has not ended them and is repeated: a
+/// later delete may only shorten what is under way (`DeletionGracePeriodSeconds`).
+#[test]
+fn a_repeated_order_has_the_shortest_grace() {
+    let rows: &[Row<&[Option<u64>], u64>] = &[
+        (&[Some(10_000)], 10_000, Same),
+        (&[Some(10_000), Some(60_000)], 10_000, Same),
+        (&[Some(10_000), Some(5_000), Some(7_000)], 5_000, Same),
+        (&[Some(60_000), Some(10_000), None], 10_000, Same),
+        (&[Some(5_000), Some(0), Some(60_000)], 0, Same),
+    ];
+    hold(rows, |orders| {
+        let mut task = running(Never);
+        for grace in orders.iter() {
+            let _ = order(&mut task, *grace);
+        }
+        let repeated = task.handle(Event::Tick, context(SHORT + MINUTE + STOP_AGAIN_MS));
+        let grace = |effect: &Effect| match effect {
+            Effect::Stop { grace_ms, .. } => Some(*grace_ms),
+            _ => None,
+        };
+        repeated.effects.iter().find_map(grace).expect("it is told again")
+    });
+}
+
 /// What becomes of a task that was ordered to end: nothing starts again, and the last exit is its phase.
 #[test]
 fn what_is_deleted_does_not_start_again() {
@@ -239,4 +266,73 @@ fn what_is_deleted_does_not_start_again() {
     assert_eq!(left(&task), "Failed");
     let late = task.handle(Event::Tick, context(MINUTE));
     assert!(!late.effects.iter().any(|effect| matches!(effect, Effect::Launch(_))), "{late:?}");
+}
+
+/// How many attempts a task that always fails has on its node, when so many may fail there: a Job's `backoffLimit` is one
+/// less, counts restarts of its Pod's containers under OnFailure, and leaves a start that cannot be made waiting for ever.
+#[test]
+fn attempts_on_one_node() {
+    let failing = |cannot_start: bool| {
+        move |(restart, limit): (RestartPolicy, Option<u32>)| {
+            let desired = Desired { restart, attempts: limit, ..Desired::once(0) };
+            let (mut task, _) =
+                Workload::assigned(TaskUid::new("t"), desired, Fetch::Missing, context(0));
+            for round in 1..=9 {
+                let attempt = task.attempt;
+                let event = if cannot_start {
+                    let failure = Failure {
+                        reason: "ImagePullFailed".to_owned(),
+                        message: "no such image".to_owned(),
+                        retry: true,
+                    };
+                    Outcome::LaunchFailed(failure)
+                } else {
+                    let started = Outcome::Launched(Started { at: Wall(0) });
+                    let _ = task.handle(Event::Attempt(attempt, started), context(0));
+                    Outcome::Exited(exit(End::Exited(3), 1))
+                };
+                let _ = task.handle(Event::Attempt(attempt, event), context(1));
+                if task.report.content.phase == Phase::Failed {
+                    assert_eq!(task.report.content.failed_attempts, round);
+                    return Some(round);
+                }
+                let _ = task.handle(Event::Tick, context(1_000_000 * u64::from(round)));
+            }
+            None
+        }
+    };
+    let rows: &[Row<(RestartPolicy, Option<u32>), Option<u32>>] = &[
+        ((Never, None), Some(1), Same),
+        ((Never, Some(3)), Some(1), Same),
+        ((OnFailure, None), None, Same),
+        ((OnFailure, Some(1)), Some(1), Same),
+        ((OnFailure, Some(4)), Some(4), Same),
+    ];
+    hold(rows, failing(false));
+    let other = "another node may have the image, and somebody asked for it to be tried";
+    let rows: &[Row<(RestartPolicy, Option<u32>), Option<u32>>] = &[
+        ((Never, None), None, Same),
+        ((Never, Some(1)), None, Differs(Some(1), other)),
+        ((OnFailure, None), None, Same),
+        ((OnFailure, Some(4)), None, Differs(Some(4), other)),
+    ];
+    hold(rows, failing(true));
+}
+
+/// An attempt that was ended for another task, or by a reboot, is none that failed.
+#[test]
+fn what_is_no_failure_uses_up_no_attempt() {
+    let desired = Desired { attempts: Some(1), restart: OnFailure, ..Desired::once(0) };
+    let (mut task, _) = Workload::assigned(TaskUid::new("t"), desired, Fetch::Nothing, context(0));
+    for attempt in 1..4 {
+        let started = Outcome::Launched(Started { at: Wall(0) });
+        let _ = task.handle(Event::Attempt(attempt, started), context(0));
+        let reboot = Outcome::Exited(exit(End::Lost(Loss::Reboot), 1));
+        let _ = task.handle(Event::Attempt(attempt, reboot), context(1));
+        assert_eq!((left(&task), task.attempt), ("runs again", attempt + 1));
+    }
+    let started = Outcome::Launched(Started { at: Wall(0) });
+    let _ = task.handle(Event::Attempt(4, started), context(0));
+    let _ = task.handle(Event::Attempt(4, Outcome::Exited(exit(End::Exited(1), 1))), context(1));
+    assert_eq!((left(&task), task.report.content.failed_attempts), ("Failed", 1));
 }

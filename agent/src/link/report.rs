@@ -23,6 +23,7 @@ pub(crate) fn to_wire(uid: &TaskUid, report: &Report) -> proto::TaskReport {
         restarts: content.restarts,
         signal: content.signal,
         ready: content.ready,
+        failed_attempts: content.failed_attempts,
     }
 }
 

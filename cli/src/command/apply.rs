@@ -10,12 +10,14 @@ use std::collections::BTreeSet;
 use std::path::PathBuf;
 
 use futures::{StreamExt as _, TryStreamExt as _};
+use kube::core::Status;
 use muster_api::duration::Span;
+use serde::Deserialize;
 use serde_json::{Map, Value, json};
 
 use super::{FirstError, Outcome, plan, settle};
 use crate::args::span;
-use crate::client::{Client, Mode};
+use crate::client::{Client, Mode, group_path};
 use crate::error::CliError;
 use crate::manifests::{self, Manifest};
 use crate::merge::{FieldChange, LAST_APPLIED, field_changes, project, three_way};
@@ -234,8 +236,48 @@ pub(super) async fn rehearse(client: &Client, steps: &[Step]) -> Result<(), CliE
     match (diagnostics.is_empty(), other) {
         (false, _) => Err(CliError::Manifests(diagnostics)),
         (true, Some(error)) => Err(error),
-        (true, None) => Ok(()),
+        (true, None) => together(client, steps).await,
     }
+}
+
+/// What `POST …/check` answers.
+#[derive(Debug, Deserialize)]
+struct Together {
+    refusals: Vec<TogetherRefusal>,
+}
+
+/// An object that would be refused after those before it.
+#[derive(Debug, Deserialize)]
+struct TogetherRefusal {
+    index: usize,
+    status: Status,
+}
+
+/// The rest of step 3: what passes alone may not pass after the others, in the order in which they are stored.
+async fn together(client: &Client, steps: &[Step]) -> Result<(), CliError> {
+    let new_task =
+        |s: &&Step| s.manifest.info.kind == "Task" && matches!(s.action, Action::Create(_));
+    if steps.iter().filter(new_task).count() < 2 {
+        return Ok(());
+    }
+    let mut ordered: Vec<&Step> = steps.iter().collect();
+    ordered.sort_by_key(|step| rank(step));
+    let objects: Vec<&Value> = ordered.iter().map(|s| &s.manifest.admitted).collect();
+    let answer = client.post_json(&group_path("check"), &json!({ "objects": objects })).await;
+    let Together { refusals } = match answer {
+        Ok(answer) => answer,
+        // An older controller says it when they are stored.
+        Err(error) if error.is_not_found() => return Ok(()),
+        Err(error) => return Err(error),
+    };
+    let mut diagnostics = Vec::new();
+    for TogetherRefusal { index, status } in refusals {
+        let Some(step) = ordered.get(index) else { continue };
+        for blamed in step.manifest.blame(client.refused(status)) {
+            diagnostics.push(blamed?);
+        }
+    }
+    if diagnostics.is_empty() { Ok(()) } else { Err(CliError::Manifests(diagnostics)) }
 }
 
 /// The order of storing: first what others refer to, then tasks as the scheduler would take them if
@@ -243,7 +285,7 @@ pub(super) async fn rehearse(client: &Client, steps: &[Step]) -> Result<(), CliE
 fn rank(step: &Step) -> (u8, Reverse<i64>) {
     let first = match step.manifest.info.kind {
         "Namespace" => 0,
-        "Node" | "ConfigMap" | "Secret" => 1,
+        "Node" | "ConfigMap" | "Secret" | "Quota" => 1,
         _ => 2,
     };
     let priority = step.manifest.admitted.pointer("/spec/priority").and_then(Value::as_i64);
@@ -262,7 +304,7 @@ async fn store(
     steps.sort_by_key(rank);
     let single = steps.len() == 1;
     let mut errors = FirstError::default();
-    let mut applied = Vec::new();
+    let (mut applied, mut left) = (Vec::new(), Vec::new());
     for step in steps {
         match perform(&session.client, &step, mode).await {
             Ok(object) => {
@@ -271,13 +313,25 @@ async fn store(
                 }
                 applied.push((step.manifest, object));
             }
-            Err(error) => refuse(&step, error, single, &mut errors, &session.ui)?,
+            Err(error) => {
+                left.push(step.manifest.title());
+                refuse(&step, error, single, &mut errors, &session.ui)?;
+            }
         }
+    }
+    if !left.is_empty() && !applied.is_empty() && mode == Mode::Store {
+        let stored: Vec<String> = applied.iter().map(|(m, _)| m.title()).collect();
+        session.ui.note(&half_way(&stored, &left));
     }
     if let Some(format) = output {
         print(&mut session.ui, &applied, single, format)?;
     }
     Ok((applied, errors.exit()))
+}
+
+/// What there is now of objects that were checked together, when somebody else came in between.
+fn half_way(stored: &[String], left: &[String]) -> String {
+    format!("stored: {}; not stored: {}", stored.join(", "), left.join(", "))
 }
 
 fn refuse(
@@ -452,6 +506,50 @@ spec:
             "{text}"
         );
         assert_eq!(fake.object("tasks/default/one"), None);
+    }
+
+    #[tokio::test]
+    async fn what_does_not_pass_together_is_said_at_its_place_and_nothing_is_stored() {
+        let dir = tempfile::tempdir().expect("a directory");
+        let fake = Fake::new();
+        let two = TASK.replace("NAME", "two").replace("priority: 3", "priority: 9");
+        let path = file(&dir, &format!("{}---\n{two}", TASK.replace("NAME", "one")));
+        let cause = json!({"field": "spec.resources.cpu", "message": "asks for too much", "reason": "FieldValueForbidden"});
+        let status = json!({"kind": "Status", "status": "Failure", "reason": "Invalid", "code": 422,
+                            "message": "m", "details": {"causes": [cause]}});
+        // More important tasks are stored first, so the second of them is the first of the file.
+        let refusals = json!({"refusals": [{"index": 1, "status": status}]});
+        let check = "POST /apis/muster.dev/v1alpha1/check";
+        fake.answer(check, refusals);
+        for verb in ["apply", "plan"] {
+            let error = fake.try_run(&[verb, "-f", &path]).await.expect_err("refused");
+            let text = error.render(&crate::output::style::Styles::default());
+            let wanted = format!("{path}:8:15: spec.resources.cpu: asks for too much\n");
+            assert!(text.starts_with(&wanted), "{text}");
+            assert_eq!(fake.object("tasks/default/one"), None);
+        }
+        fake.answer(check, json!({"refusals": []}));
+        let stored = "task/two created\ntask/one created\n";
+        assert_eq!(fake.run(&["apply", "-f", &path]).await, (exit::OK, stored.to_owned()));
+    }
+
+    #[tokio::test]
+    async fn who_is_refused_in_the_middle_hears_what_was_stored() {
+        let dir = tempfile::tempdir().expect("a directory");
+        let fake = Fake::new();
+        fake.refuse_late("two", "spec.resources.cpu", "asks for more than is left");
+        let path = file(
+            &dir,
+            &format!("{}---\n{}", TASK.replace("NAME", "one"), TASK.replace("NAME", "two")),
+        );
+        let (code, out) = fake.run(&["apply", "-f", &path]).await;
+        assert_eq!((code, out.as_str()), (exit::INVALID, "task/one created\n"));
+        assert!(fake.object("tasks/default/one").is_some());
+        let titles = |names: &[&str]| names.iter().map(|n| format!("task/{n}")).collect::<Vec<_>>();
+        assert_eq!(
+            super::half_way(&titles(&["one"]), &titles(&["two", "three"])),
+            "stored: task/one; not stored: task/two, task/three"
+        );
     }
 
     #[tokio::test]

@@ -13,9 +13,11 @@ use crate::error::CliError;
 use crate::output::human;
 use crate::output::objects::full_name;
 use crate::session::Session;
+use crate::successor;
 use crate::watch::{Change, Follow, merged};
 
-/// An object whose end is waited for. A later one of the same name is another object.
+/// An object whose end is waited for. A later one of the same name is another object, but for a task that is tried on
+/// another node.
 #[derive(Debug, Clone)]
 pub(crate) struct Doomed {
     pub(crate) info: &'static KindInfo,
@@ -72,13 +74,16 @@ pub(crate) async fn until_gone(
         };
         match change {
             Change::Applied(object) => {
-                let uid = uid(&object);
+                let Some((uid, before)) = successor::claim(&mut left, &object) else { continue };
+                before.iter().for_each(|before| progress.drop_row(before));
                 if let Some(doomed) = left.get_mut(&uid) {
                     progress.show(&uid, &waiting(doomed.info, &object));
                     doomed.object = object;
                     seen.push(uid);
                 }
             }
+            // Another of its name follows at once.
+            Change::Deleted(object) if successor::is_tried_again(&object) => {}
             Change::Deleted(object) => {
                 let uid = uid(&object);
                 left.remove(&uid);

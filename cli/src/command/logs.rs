@@ -1,13 +1,17 @@
-//! `muster logs`: what a task wrote, streamed from its node.
+//! `muster logs`: what a task wrote, streamed from its node; with `--follow` from the next one, too, when it is tried there.
 
 use muster_api::duration::Span;
+use muster_api::kind::task::{Outlook, Task};
 
 use super::Outcome;
 use crate::args::span;
-use crate::client::{path, with_query};
+use crate::client::{Selection, path, with_query};
+use crate::error::CliError;
 use crate::exit;
 use crate::session::Session;
-use crate::target;
+use crate::successor;
+use crate::target::{self, Named};
+use crate::watch::{Change, Follow};
 
 /// `muster logs`.
 #[derive(Debug, clap::Args)]
@@ -54,11 +58,65 @@ pub(crate) async fn run(args: Args, session: &mut Session) -> Outcome {
     let of = path(named.info, Some(&session.namespace), named.name);
     let pairs = args.pairs();
     let pairs: Vec<(&str, &str)> = pairs.iter().map(|(k, v)| (*k, v.as_str())).collect();
-    let mut stream = session.client.stream(&with_query(&format!("{of}/log"), &pairs)).await?;
-    while let Some(bytes) = stream.next_bytes().await? {
-        session.ui.print_bytes(&bytes)?;
+    loop {
+        let uid = match args.follow {
+            true => uid_now(&named, session).await?,
+            false => String::new(),
+        };
+        let uri = with_query(&format!("{of}/log"), &pairs);
+        let mut stream = session.client.stream(&uri).await?;
+        while let Some(bytes) = stream.next_bytes().await? {
+            session.ui.print_bytes(&bytes)?;
+        }
+        if !args.follow || !goes_on_elsewhere(&named, &uid, session).await? {
+            return Ok(exit::OK);
+        }
     }
-    Ok(exit::OK)
+}
+
+async fn uid_now(named: &Named<'_>, session: &Session) -> Result<String, CliError> {
+    let name = named.name.unwrap_or_default();
+    let object = session.client.get(named.info, Some(&session.namespace), name).await?;
+    Ok(object["metadata"]["uid"].as_str().unwrap_or_default().to_owned())
+}
+
+/// After the log of `uid` has ended: waits until the task runs on another node, under another uid. False: it has ended for
+/// good, or is gone.
+async fn goes_on_elsewhere(
+    named: &Named<'_>,
+    uid: &str,
+    session: &Session,
+) -> Result<bool, CliError> {
+    let name = named.name.unwrap_or_default();
+    let mut changes =
+        Follow::new(&session.client, named.info, Some(&session.namespace), Selection::name(name));
+    let mut there = false;
+    loop {
+        let object = match changes.next().await? {
+            Change::Applied(object) => object,
+            Change::Deleted(object) if successor::is_tried_again(&object) => continue,
+            Change::Deleted(_) => return Ok(false),
+            Change::Synced if there => continue,
+            Change::Synced => return Ok(false),
+        };
+        there = true;
+        let Ok(task) = serde_json::from_value::<Task>(object) else { return Ok(false) };
+        let status = task.status.clone().unwrap_or_default();
+        let is_same = task.metadata.uid.as_deref() == Some(uid);
+        if is_same && task.spec.reschedule.is_none() && status.stop.is_none() {
+            // Nothing follows it.
+            return Ok(false);
+        }
+        match task.outlook() {
+            Outlook::Over(_) => return Ok(!is_same && status.attempt > 0),
+            Outlook::Alive if !is_same && status.attempt > 0 => {
+                let node = status.node.unwrap_or_default();
+                session.ui.note(&format!("task/{name} goes on on {node}"));
+                return Ok(true);
+            }
+            Outlook::Alive | Outlook::Again { .. } => {}
+        }
+    }
 }
 
 #[cfg(test)]

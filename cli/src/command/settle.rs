@@ -17,6 +17,7 @@ use crate::output::columns::task as columns;
 use crate::output::human;
 use crate::output::progress::Progress;
 use crate::session::Session;
+use crate::successor;
 use crate::target;
 use crate::watch::{Change, Follow, merged};
 
@@ -42,6 +43,8 @@ fn verdict(status: &TaskStatus) -> Verdict {
         TaskPhase::Running => Verdict::Runs,
         TaskPhase::Succeeded => Verdict::Succeeded,
         TaskPhase::Failed => Verdict::Failed,
+        // It waits for nobody but the clock.
+        TaskPhase::Pending if status.why.iter().any(|w| w.reason == "BackOff") => Verdict::Moving,
         TaskPhase::Pending if !status.why.is_empty() => Verdict::Waits,
         TaskPhase::Pending
         | TaskPhase::Bound
@@ -108,21 +111,26 @@ fn note(change: Change, rows: &mut BTreeMap<String, Row>, progress: &mut Progres
         Change::Deleted(object) => (object, true),
         Change::Synced => return false,
     };
-    let uid = object.pointer("/metadata/uid").and_then(Value::as_str).unwrap_or_default();
-    let Some(row) = rows.get_mut(uid) else { return false };
+    let Some((uid, another)) = successor::claim(rows, &object) else { return false };
+    another.iter().for_each(|another| progress.drop_row(another));
+    let Some(row) = rows.get_mut(&uid) else { return false };
     let status = object.get("status").cloned().unwrap_or_default();
     row.status = serde_json::from_value(status).unwrap_or_default();
     let before = row.verdict;
-    row.verdict = if gone { Verdict::Deleted } else { verdict(&row.status) };
+    row.verdict = match (successor::is_tried_again(&object), gone) {
+        (true, _) => Verdict::Moving,
+        (false, true) => Verdict::Deleted,
+        (false, false) => verdict(&row.status),
+    };
     let text = line(row);
     match row.verdict {
         Verdict::Moving => {
-            progress.unsettle(uid);
-            progress.show(uid, &text);
+            progress.unsettle(&uid);
+            progress.show(&uid, &text);
         }
-        Verdict::Waits => progress.settle(uid, "…", &text),
-        Verdict::Runs | Verdict::Succeeded => progress.settle(uid, "✓", &text),
-        Verdict::Failed | Verdict::Deleted => progress.settle(uid, "✗", &text),
+        Verdict::Waits => progress.settle(&uid, "…", &text),
+        Verdict::Runs | Verdict::Succeeded => progress.settle(&uid, "✓", &text),
+        Verdict::Failed | Verdict::Deleted => progress.settle(&uid, "✗", &text),
     }
     row.verdict != before
 }

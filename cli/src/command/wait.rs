@@ -16,6 +16,7 @@ use crate::error::CliError;
 use crate::exit;
 use crate::output::objects::full_name;
 use crate::session::Session;
+use crate::successor;
 use crate::target::{self, Named};
 use crate::watch::{Change, Follow, merged};
 
@@ -279,22 +280,27 @@ async fn until_holds(args: &Args, objects: Vec<Doomed>, session: &mut Session) -
             Change::Deleted(object) => (object, true),
             Change::Synced => continue,
         };
-        let uid = object.pointer("/metadata/uid").and_then(Value::as_str).unwrap_or_default();
-        let Some(awaited) = left.get_mut(uid) else { continue };
+        if successor::is_tried_again(&object) {
+            // The next object of its name is waited for.
+            continue;
+        }
+        let Some((uid, before)) = successor::claim(&mut left, &object) else { continue };
+        before.iter().for_each(|before| progress.drop_row(before));
+        let Some(awaited) = left.get_mut(&uid) else { continue };
         let title = full_name(awaited.info, &object);
         if gone || wanted.is_hopeless(awaited.info, &object) {
             progress.end(false);
             return Err(ended(&title, &object, gone, wanted));
         }
         if wanted.holds(awaited.info, &object) {
-            progress.drop_row(uid);
-            left.remove(uid);
+            progress.drop_row(&uid);
+            left.remove(&uid);
             session.ui.line(&format!("{title} is {}", wanted.text()))?;
             continue;
         }
         let phase = object.pointer("/status/phase").and_then(Value::as_str);
         let now = phase.map(|p| format!(" (now {p})")).unwrap_or_default();
-        progress.show(uid, &format!("{title} is not yet {}{now}", wanted.text()));
+        progress.show(&uid, &format!("{title} is not yet {}{now}", wanted.text()));
         awaited.object = object;
     }
     progress.end(false);
@@ -409,6 +415,35 @@ mod tests {
             .expect_err("it failed");
         assert_eq!(error.class().exit(), exit::TASK_ENDED);
         assert!(error.to_string().contains("ended as Failed"), "{error}");
+    }
+
+    #[tokio::test]
+    async fn a_task_that_is_tried_elsewhere_is_waited_for_under_its_next_uid() {
+        let fake = Fake::new();
+        let put = |uid: &str, status: Value| {
+            let mut object = task("a", status);
+            object["metadata"]["uid"] = uid.into();
+            object["spec"]["reschedule"] = json!({"maxAttempts": 2});
+            fake.put("tasks/default/a", object);
+        };
+        let failed = |used: u32, earlier: Value| json!({"phase": "Failed", "node": "n", "reason": "Error", "attemptsUsed": used, "earlier": earlier});
+        let earlier = json!([{"uid": "one", "node": "n", "attempts": 1}]);
+        for (end, code) in [("Succeeded", exit::OK), ("Failed", exit::TASK_ENDED)] {
+            put("one", json!({"phase": "Running", "node": "n"}));
+            let wait = fake.try_run(&["wait", "task/a", "--for=phase=Succeeded"]);
+            let (done, ()) = tokio::join!(wait, async {
+                tokio::time::sleep(std::time::Duration::from_millis(30)).await;
+                put("one", failed(0, json!([])));
+                fake.remove("tasks/default/a");
+                put("two", json!({"phase": "Pending", "attemptsUsed": 1, "earlier": earlier}));
+                let mut status = failed(1, earlier.clone());
+                status["phase"] = end.into();
+                put("two", status);
+            });
+            let came = done.map_or_else(|error| error.class().exit(), |(code, _)| code);
+            assert_eq!(came, code, "{end}");
+            fake.remove("tasks/default/a");
+        }
     }
 
     #[test]

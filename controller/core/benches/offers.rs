@@ -233,6 +233,7 @@ fn decisions(robots: usize, tasks: usize) {
             title: format!("default/task-{i}").into(),
             spec: Arc::new(spec),
             since: 0,
+            avoid: Arc::default(),
         }];
         let moved = numbers.index(robots);
         places[moved] += nalgebra::Vector3::new(0.1, 0.0, 0.0);

@@ -6,6 +6,7 @@
 
 use std::fmt;
 
+use jiff::Timestamp;
 use muster_api::kind::task::NodeRefusal;
 use muster_api::kind::task::config::Source;
 
@@ -49,6 +50,19 @@ pub enum Hold {
         /// What is missing, a clause whose subject is that task.
         why: String,
     },
+    /// The task has failed on another node, and waits before the next one is tried.
+    BackOff {
+        /// Until then.
+        until: Timestamp,
+        /// Where it failed last.
+        node: String,
+        /// How, a clause.
+        end: String,
+        /// How many attempts have failed.
+        used: u32,
+        /// How many may.
+        most: u32,
+    },
     /// All that the task wants together is more than one message to its node takes.
     TooLarge {
         /// Bytes.
@@ -72,6 +86,7 @@ impl Hold {
             Hold::NotText { source: Secret, .. } => "SecretValueNotText",
             Hold::DependencyNotFound { .. } => "DependencyNotFound",
             Hold::DependencyNotMet { .. } => "DependencyNotMet",
+            Hold::BackOff { .. } => "BackOff",
             Hold::TooLarge { .. } => "ConfigTooLarge",
         }
     }
@@ -81,6 +96,7 @@ impl Hold {
     pub fn field(&self) -> &'static str {
         match self {
             Hold::DependencyNotFound { .. } | Hold::DependencyNotMet { .. } => "spec.dependsOn",
+            Hold::BackOff { .. } => "spec.reschedule",
             Hold::ObjectNotFound { .. }
             | Hold::KeyNotFound { .. }
             | Hold::NotText { .. }
@@ -126,6 +142,11 @@ impl fmt::Display for Hold {
             Hold::DependencyNotMet { task, why } => {
                 write!(f, "waits for task {task}, which {why}")
             }
+            Hold::BackOff { until, node, end, used, most } => write!(
+                f,
+                "failed on {node} ({end}); is tried again at {until:.0}, attempt {} of {most}",
+                used.saturating_add(1)
+            ),
             Hold::TooLarge { bytes, most } => write!(
                 f,
                 "its ConfigMaps and Secrets come to {bytes} bytes, at most {most} are sent to a node"

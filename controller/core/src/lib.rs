@@ -22,6 +22,8 @@
 //! | [`hold`] | why a task is not considered for a place at all |
 //! | [`config`] | what a task gets of ConfigMaps and Secrets |
 //! | [`deadline`] | when a task has been on its node, or has been over, for long enough |
+//! | [`radius`] | when a robot has left the radius of a task that runs on it |
+//! | [`reschedule`] | whether a task that failed is tried on another node, and when |
 //! | [`deletion`] | when an object is to be gone that somebody deletes |
 //! | [`recent`] | one allocation for what many nodes or tasks have in common |
 //! | [`node_health`] | when a node counts as lost |
@@ -45,8 +47,10 @@ pub mod offer;
 pub mod poses;
 pub mod preempt;
 pub mod quota;
+pub mod radius;
 pub mod recent;
 pub mod report;
+pub mod reschedule;
 pub mod schedule;
 pub mod space;
 pub mod stray;

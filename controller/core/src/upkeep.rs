@@ -37,34 +37,38 @@ pub fn upkeep(node: &Node, now: Timestamp) -> Upkeep {
         return upkeep;
     }
     let mut open: Option<(Timestamp, &MaintenanceWindow)> = None;
-    let mut drain = false;
+    // Of those that drain, the one that ends first: until then at least it is so.
+    let mut drain: Option<(Timestamp, &MaintenanceWindow)> = None;
     for window in windows {
         let (until, next) = match window.at(now) {
             Moment::Open { until } => (Some(until), Some(until)),
             Moment::Closed { next } => (None, next),
         };
         if let Some(until) = until {
-            drain |= window.drain;
+            if window.drain && drain.is_none_or(|(first, _)| until < first) {
+                drain = Some((until, window));
+            }
             if open.is_none_or(|(latest, _)| until > latest) {
                 open = Some((until, window));
             }
         }
         upkeep.look_again = upkeep.look_again.into_iter().chain(next).min();
     }
-    let message = open.map(|(until, window)| {
-        let reason = Some(&window.reason).filter(|reason| !reason.is_empty());
-        let reason = reason.map(|reason| format!(": {reason}")).unwrap_or_default();
-        format!("until {until}{reason}")
-    });
-    if drain && node.mission_lock().is_none() {
-        upkeep.drain =
-            message.as_ref().map(|message| format!("its node is in maintenance {message}"));
+    if node.mission_lock().is_none() {
+        upkeep.drain = drain.map(|of| format!("its node is in maintenance {}", until(of)));
     }
-    upkeep.conditions.push(match message {
+    upkeep.conditions.push(match open.map(until) {
         Some(message) => Condition::new(MAINTENANCE, true, "WindowOpen", message),
         None => Condition::new(MAINTENANCE, false, "WindowClosed", String::new()),
     });
     upkeep
+}
+
+fn until((end, window): (Timestamp, &MaintenanceWindow)) -> String {
+    match window.reason.is_empty() {
+        true => format!("until {end}"),
+        false => format!("until {end}: {}", window.reason),
+    }
 }
 
 /// Low below the least, and until it is a margin above it.
@@ -143,6 +147,18 @@ mod tests {
             Some("its node is in maintenance until 2026-03-01T04:00:00Z: new wheels")
         );
         assert_eq!(first.look_again, Some(at("2026-03-01T03:00:00Z")));
+        let both = upkeep(&node, at("2026-03-01T03:30:00Z"));
+        let maintenance =
+            both.conditions.iter().find(|c| c.r#type == MAINTENANCE).map(|c| &*c.message);
+        assert_eq!(
+            maintenance,
+            Some("until 2026-03-01T07:00:00Z"),
+            "it lasts until the last one ends"
+        );
+        assert_eq!(
+            both.drain, first.drain,
+            "the window that drains is named, not one that does not"
+        );
         let note = BTreeMap::from([(MISSION_LOCK.to_owned(), "anna: far away".to_owned())]);
         node.metadata.annotations = Some(note);
         let locked = upkeep(&node, at("2026-03-01T02:30:00Z"));

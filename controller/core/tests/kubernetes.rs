@@ -43,6 +43,7 @@ fn demand(uid: &str, spec: &Value, since: u64) -> Demand {
         title: format!("default/{uid}").into(),
         spec: Arc::new(serde_json::from_value(spec).expect("a spec")),
         since,
+        avoid: Arc::default(),
     }
 }
 

@@ -13,8 +13,8 @@ use crate::objects::{self, NODES};
 use crate::store::{Key, Op, Precondition};
 
 /// The status of a task that was just bound. A task that waited has nothing in its status but why it did, so it is made
-/// anew.
-pub(super) fn status(bind: &Bind, now: Timestamp) -> TaskStatus {
+/// anew, with what is known of other nodes that were tried before.
+pub(super) fn status(bind: &Bind, past: Option<&TaskStatus>, now: Timestamp) -> TaskStatus {
     TaskStatus {
         phase: TaskPhase::Bound,
         node: Some(bind.node.to_string()),
@@ -24,7 +24,8 @@ pub(super) fn status(bind: &Bind, now: Timestamp) -> TaskStatus {
             name: LeaseSpec::object_name(bind.node.as_str(), group),
             epoch: *epoch,
         }),
-        ..TaskStatus::default()
+        not_before: None,
+        ..past.map(TaskStatus::carried).unwrap_or_default()
     }
 }
 

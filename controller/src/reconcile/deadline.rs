@@ -10,6 +10,7 @@ use std::sync::Arc;
 use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::MicroTime;
 use muster_api::kind::task::{DEADLINE_EXCEEDED, StopOrder, Task};
+use muster_api::phase::TaskPhase;
 use muster_controller_core::deadline::{Due, due};
 
 use super::{again, next_events, watch_from_now};
@@ -93,13 +94,7 @@ async fn act(context: &Context, key: &Key, now: Timestamp) -> Result<(), StoreEr
         stopped = None;
         match due(&task).filter(|due| due.at() <= now)? {
             Due::Stop(_) => {
-                let seconds = task.spec.active_deadline_seconds.unwrap_or_default();
-                let stop = StopOrder {
-                    reason: DEADLINE_EXCEEDED.to_owned(),
-                    message: format!("was on its node for {seconds} s, its activeDeadlineSeconds"),
-                    at: MicroTime(now),
-                };
-                task.status.get_or_insert_default().stop = Some(stop);
+                end(&mut task, now);
                 let op = objects::replace(stored, &task);
                 stopped = Some(task);
                 Some(vec![op])
@@ -112,6 +107,26 @@ async fn act(context: &Context, key: &Key, now: Timestamp) -> Result<(), StoreEr
         context.events.ordered_to_end(&task, DEADLINE_EXCEEDED);
     }
     Ok(())
+}
+
+/// Orders the end of a task whose time has passed. One that waits for another node has nothing to end: it has Failed.
+fn end(task: &mut Task, now: Timestamp) {
+    let seconds = task.spec.active_deadline_seconds.unwrap_or_default();
+    let status = task.status.get_or_insert_default();
+    let place = if status.earlier.is_empty() { "was on its node" } else { "was under way" };
+    let stop = StopOrder {
+        reason: DEADLINE_EXCEEDED.to_owned(),
+        message: format!("{place} for {seconds} s, its activeDeadlineSeconds"),
+        at: MicroTime(now),
+    };
+    if status.phase == TaskPhase::Pending {
+        status.phase = TaskPhase::Failed;
+        (status.reason, status.message) = (stop.reason.clone(), stop.message.clone());
+        status.finished_at = Some(MicroTime(now));
+        status.why.clear();
+        status.nominated_node = None;
+    }
+    status.stop = Some(stop);
 }
 
 #[cfg(test)]

@@ -478,7 +478,7 @@ impl Desk {
         for (prepared, bound) in pending.launches.iter().zip(binds) {
             let mut value = prepared.object.clone();
             value["spec"]["placement"]["node"] = Value::from(bound.node.as_str());
-            value["status"] = crate::objects::to_value(&bind::status(bound, now));
+            value["status"] = crate::objects::to_value(&bind::status(bound, None, now));
             ops.push(Op::Put {
                 key: prepared.key.clone(),
                 value,

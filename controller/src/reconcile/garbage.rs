@@ -62,6 +62,13 @@ impl Graph {
         }
     }
 
+    /// Whether the object is there and still names the owners that are known here: events may be on their way that say
+    /// whom it belongs to now.
+    fn is_present(&self, context: &Context, key: &Key) -> bool {
+        let present = context.store.get(key).map(|stored| owner_uids(&stored.value()));
+        present.as_ref().is_some_and(|owners| self.owners.get(key) == Some(owners))
+    }
+
     fn lost(&self, key: &Key) -> bool {
         self.owners
             .get(key)
@@ -88,7 +95,7 @@ async fn follow(context: &Context) -> Result<(), StoreError> {
     let mut look: BTreeSet<Key> = graph.owners.keys().cloned().collect();
     loop {
         for key in std::mem::take(&mut look) {
-            if graph.lost(&key) && context.store.get(&key).is_some() {
+            if graph.lost(&key) && graph.is_present(context, &key) {
                 tracing::info!(%key, "its owner is gone, deleting it");
                 // A refusal (it went already, it may not go) leaves nothing to do here.
                 drop(delete_object(context, &key).await);

@@ -5,6 +5,8 @@
 //! |---|---|---|
 //! | [`schedule`] | Nodes, Tasks, Leases, ConfigMaps, Secrets | binds Pending tasks, orders ends to make room, or writes why not |
 //! | [`deadline`] | Tasks with deadlines | orders the end of those that have run long enough, removes those that ended long ago |
+//! | [`radius`] | live poses, Tasks with a radius | ends those whose robot has left |
+//! | [`reschedule`] | Tasks that have failed | puts new ones in their place, for another node |
 //! | [`desk`] | frameworks, in [`schedule`]'s own task | shows offers, takes Accepts |
 //! | [`failover`] | Frameworks | removes those that stay away, writes their numbers |
 //! | `moves` | live poses, in [`schedule`]'s own task | puts robots where they are |
@@ -33,6 +35,8 @@ mod moves;
 pub mod orders;
 mod preempt;
 pub mod quotas;
+pub mod radius;
+pub mod reschedule;
 pub mod schedule;
 pub mod taskset;
 pub mod upkeep;
@@ -86,6 +90,8 @@ pub fn spawn(
     run("quotas", Box::pin(quotas::run(Arc::clone(context), counts)));
     run("health", Box::pin(health::run(Arc::clone(context), Arc::clone(sessions))));
     run("deadline", Box::pin(deadline::run(Arc::clone(context))));
+    run("radius", Box::pin(radius::run(Arc::clone(context), Arc::clone(poses))));
+    run("reschedule", Box::pin(reschedule::run(Arc::clone(context))));
     run("deletion", Box::pin(deletion::run(Arc::clone(context))));
     run("garbage", Box::pin(garbage::run(Arc::clone(context))));
     run("taskset", Box::pin(taskset::run(Arc::clone(context))));

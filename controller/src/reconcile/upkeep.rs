@@ -110,7 +110,8 @@ fn set(node: &mut Node, upkeep: &Upkeep, now: Timestamp) -> bool {
     changed
 }
 
-/// Orders the end of every task there that does not tolerate maintenance.
+/// Orders the end of every task there that does not tolerate maintenance. A mission that begins meanwhile keeps what has
+/// no order yet.
 async fn drain_node(context: &Context, node: &str, why: &str) -> Result<(), StoreError> {
     for (stored, task) in objects::tasks_holding(&context.store, node) {
         if upkeep::stays(&task.spec) {
@@ -118,11 +119,13 @@ async fn drain_node(context: &Context, node: &str, why: &str) -> Result<(), Stor
         }
         let mut ordered = None;
         objects::change(&context.store, &stored.key, |present, mut task: Task| {
+            ordered = None;
             let status = task.status.as_mut()?;
             let concerns = status.phase.holds_node() && status.node.as_deref() == Some(node);
             if !concerns || status.stop.is_some() || task.metadata.deletion_timestamp.is_some() {
                 return None;
             }
+            let unlocked = objects::unlocked(&context.store, node).ok()?;
             status.stop = Some(StopOrder {
                 reason: NODE_MAINTENANCE.to_owned(),
                 message: why.to_owned(),
@@ -130,7 +133,7 @@ async fn drain_node(context: &Context, node: &str, why: &str) -> Result<(), Stor
             });
             let op = objects::replace(present, &task);
             ordered = Some(task);
-            Some(vec![op])
+            Some(vec![op, unlocked])
         })
         .await?;
         if let Some(task) = ordered {

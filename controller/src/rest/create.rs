@@ -5,6 +5,7 @@ use std::sync::Arc;
 use axum::response::Response;
 use http::{HeaderValue, StatusCode, header};
 use muster_api::kind::task::Resources;
+use muster_api::validate::Violations;
 use serde::Deserialize as _;
 use serde_json::Value;
 
@@ -99,16 +100,39 @@ pub(crate) fn pass(
     if resource != TASKS {
         return Ok(None);
     }
-    let entry =
-        super::registry::of(TASKS).ok_or_else(|| Failure::internal("tasks are not served"))?;
-    let resources = match &object["spec"]["resources"] {
-        Value::Null => Resources::default(),
-        given => Resources::deserialize(given).map_err(|e| Failure::internal(e.to_string()))?,
-    };
+    let resources = resources_of(object)?;
     let text = |field: &str| metadata::text(object, field).unwrap_or_default();
     let door = &context.door;
     door.admit(&context.store, text("namespace"), text("uid"), &resources)
-        .map_err(|violations| Failure::invalid(entry, text("name"), &violations))
+        .map_err(|violations| refused(text("name"), &violations))
+}
+
+/// As [`pass`], for who only asks.
+fn would_pass(context: &Context, resource: Resource, object: &Value) -> Result<(), Failure> {
+    let text = |field: &str| metadata::text(object, field).unwrap_or_default();
+    let quota = quota::of(&context.store, text("namespace")).filter(|_| resource == TASKS);
+    let Some(quota) = quota else { return Ok(()) };
+    let resources = resources_of(object)?;
+    let of = (text("namespace"), &quota);
+    let judged = context.door.rehearse(&context.store, of, [&resources]);
+    let violations = judged.into_iter().find_map(Result::err);
+    violations.map_or(Ok(()), |violations| Err(refused(text("name"), &violations)))
+}
+
+/// What a task asks for.
+pub(super) fn resources_of(task: &Value) -> Result<Resources, Failure> {
+    match &task["spec"]["resources"] {
+        Value::Null => Ok(Resources::default()),
+        given => Resources::deserialize(given).map_err(|e| Failure::internal(e.to_string())),
+    }
+}
+
+/// What a task is told that its namespace's quota does not let in.
+pub(super) fn refused(name: &str, violations: &Violations) -> Failure {
+    match super::registry::of(TASKS) {
+        Some(entry) => Failure::invalid(entry, name, violations),
+        None => Failure::internal("tasks are not served"),
+    }
 }
 
 /// What is asked for.
@@ -131,7 +155,7 @@ async fn store_new(
             return Err(Failure::already_exists(new.entry, name));
         }
         namespace::admit_into(context, new.entry, new.namespace, name)?;
-        drop(pass(context, new.entry.resource, &prepared.object)?);
+        would_pass(context, new.entry.resource, &prepared.object)?;
         return Ok((prepared.object.to_string().into(), prepared.warnings));
     }
     let _pass = pass(context, new.entry.resource, &prepared.object)?;

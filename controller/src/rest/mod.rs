@@ -17,6 +17,7 @@
 //! | `fence` | a person's word that a node is off |
 //! | `offers` | what frameworks are offered, and why they are not |
 //! | `poses` | where robots are now |
+//! | `together` | what objects have wrong only all together |
 //! | `question` | plan, why, usage: answers that are no objects |
 //! | [`log`] | logs of tasks |
 //! | [`failure`] | every refusal as a `metav1.Status` |
@@ -43,6 +44,7 @@ mod question;
 pub(crate) mod registry;
 mod scale;
 mod selector;
+mod together;
 pub mod token;
 mod update;
 mod watch;
@@ -138,6 +140,7 @@ async fn dispatch(
         Target::Discovery(what) => discovery::answer(what),
         Target::Join => join::join(call).await,
         Target::Plan => question::plan(call).await,
+        Target::Check => together::check(call).await,
         Target::Usage => question::usage(&call),
         Target::Offers => offers::list(call.context).await,
         Target::Poses if verb == Verb::Watch => poses::watch(&call),

@@ -128,6 +128,8 @@ pub(crate) enum Target {
     Join,
     /// What the real scheduler would do with some objects.
     Plan,
+    /// What objects have wrong only all together.
+    Check,
     /// What nodes and tasks use now.
     Usage,
     /// What frameworks are offered now.
@@ -147,6 +149,7 @@ impl Target {
             Self::Tokens(_) => Some("jointokens"),
             Self::Join => Some("join"),
             Self::Plan => Some("plan"),
+            Self::Check => Some("check"),
             Self::Usage => Some("usage"),
             Self::Offers => Some("offers"),
             Self::Poses => Some("poses"),
@@ -177,6 +180,7 @@ pub(crate) fn read(method: &Method, uri: &Uri) -> Result<(Verb, Target), Failure
         ["apis", muster_api::GROUP, muster_api::VERSION, ref rest @ ..] => match rest {
             ["join"] => Target::Join,
             ["plan"] => Target::Plan,
+            ["check"] => Target::Check,
             ["usage"] => Target::Usage,
             ["offers"] => Target::Offers,
             ["poses"] => Target::Poses,
@@ -201,7 +205,7 @@ pub(crate) fn read(method: &Method, uri: &Uri) -> Result<(Verb, Target), Failure
             | Target::Discovery(_)
             | Target::Usage
     );
-    let post_only = matches!(target, Target::Join | Target::Plan);
+    let post_only = matches!(target, Target::Join | Target::Plan | Target::Check);
     let followed = matches!(target, Target::Poses) && !matches!(verb, Verb::List | Verb::Watch);
     if read_only && verb != Verb::Get || post_only && verb != Verb::Create || followed {
         return Err(Failure::method(method));

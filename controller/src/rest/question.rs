@@ -74,6 +74,7 @@ pub(super) async fn why(call: Call, target: Object) -> Answer {
             title: title.into(),
             spec: Arc::new(task.spec),
             since: 0,
+            avoid: Arc::default(),
         };
         scheduler.why(demand).await.map_err(ended)?
     } else {
@@ -122,7 +123,7 @@ pub(super) async fn plan(call: Call) -> Answer {
 }
 
 /// A task that would be created, with what its namespace's quota fills in; anything else as it is.
-fn with_defaults(context: &Context, object: &Value) -> Value {
+pub(super) fn with_defaults(context: &Context, object: &Value) -> Value {
     let mut object = object.clone();
     let text = |pointer: &str| object.pointer(pointer).and_then(Value::as_str);
     let namespace = text("/metadata/namespace").unwrap_or(DEFAULT).to_owned();
@@ -212,6 +213,7 @@ fn demand(index: usize, object: &Value) -> Result<Demand, Failure> {
         spec: Arc::new(task.spec),
         // After everything that waits.
         since: u64::MAX / 2 + index as u64,
+        avoid: Arc::default(),
     })
 }
 

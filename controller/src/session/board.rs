@@ -213,6 +213,7 @@ fn assignment(store: &Store, task: &Task) -> wire::Assignment {
         ended,
         config,
         dependencies,
+        attempts: task.spec.attempts_here(status.attempts_used).unwrap_or_default(),
         framework: super::frameworks::owning(&task.metadata)
             .map(|o| wire::Framework { id: o.uid.clone(), name: o.name.clone() }),
     }

@@ -71,6 +71,7 @@ pub(crate) async fn apply(
         status.started_at.clone_from(&started);
         status.finished_at.clone_from(&finished);
         status.report_sequence = report.sequence;
+        status.failed_attempts = report.failed_attempts;
         status.set_ready(report.ready, MicroTime(context.clock.now()));
         // One that was finished, or failed, before the order came to it has an end of its own.
         let by_order = phase.is_terminal() && report.reason == STOPPED;

@@ -178,6 +178,35 @@ async fn watches_resume_and_carry_what_was(store: &Store) {
     assert_eq!(ahead, WatchError::Ahead { asked: start + 1000, current: start + 4 });
 }
 
+async fn a_namesake_follows_in_one_transaction(store: &Store) {
+    let named = |uid: &str| {
+        let mut value = body("same", 1);
+        value["metadata"]["uid"] = uid.into();
+        value
+    };
+    let key = task("same");
+    let old = store.create(key.clone(), named("one")).await.unwrap();
+    let start = store.revision();
+    let mut changes = store.watch(TASKS, start).unwrap();
+    let put = |uid| Op::create(key.clone(), named(uid));
+    let late = store.apply(vec![Op::remove(key.clone(), old.revision + 7), put("two")]).await;
+    assert!(matches!(late, Err(StoreError::Conflict { .. })), "{late:?}");
+    let first = store.apply(vec![put("two"), Op::remove(key.clone(), old.revision)]).await;
+    assert!(matches!(first, Err(StoreError::AlreadyExists { .. })), "{first:?}");
+    store.apply(vec![Op::remove(key.clone(), old.revision), put("two")]).await.unwrap();
+    let seen: Vec<(Change, u64, String)> = changes
+        .next()
+        .await
+        .unwrap()
+        .iter()
+        .map(|event| (event.change, event.revision() - start, event.object.uid.to_string()))
+        .collect();
+    let (one, two) = ("one".to_owned(), "two".to_owned());
+    assert_eq!(seen, [(Change::Delete, 1, one), (Change::Put, 2, two)]);
+    assert_eq!(&*store.get(&key).unwrap().uid, "two");
+    store.delete(key, Precondition::Any).await.unwrap();
+}
+
 async fn updates_do_not_lose_each_other(store: &Store) {
     create(store, "counter").await;
     let mut clients = JoinSet::new();
@@ -226,6 +255,7 @@ async fn suite(running: Running) {
     transactions_are_whole(store).await;
     lists_are_ordered_and_exact(store).await;
     watches_resume_and_carry_what_was(store).await;
+    a_namesake_follows_in_one_transaction(store).await;
     updates_do_not_lose_each_other(store).await;
     compaction_expires_watches(store).await;
     malformed_values_are_refused(store).await;

@@ -10,6 +10,8 @@ mod fleet;
 mod objects;
 mod poses;
 mod quotas;
+mod radius;
 mod removal;
+mod reschedule;
 mod support;
 mod watching;

@@ -163,3 +163,68 @@ async fn a_set_makes_as_many_as_there_is_room_for() {
         .await;
     cluster.running.shut_down().await.unwrap();
 }
+
+/// What one by one would pass and not together is said before anything is stored, in the order of storing.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn tasks_are_checked_together_and_nobody_is_let_in_by_asking() {
+    let cluster = Cluster::start().await;
+    let admin = cluster.admin().await;
+    send(&admin, "POST", QUOTAS, quota(json!({"hard": {"cpu": "1"}}))).await;
+    let asking = |name: &str, cpu: &str| asking(name, json!({"cpu": cpu}));
+    assert_eq!(send(&admin, "POST", TASKS, asking("old", "300m")).await.0, 201);
+    let check = |objects: Value| {
+        let admin = admin.clone();
+        async move {
+            let path = format!("{G}/check");
+            let (code, answer) = send(&admin, "POST", &path, json!({"objects": objects})).await;
+            assert_eq!(code, 200, "{answer}");
+            let row = |refusal: &Value| {
+                let status = &refusal["status"];
+                let message = status["details"]["causes"][0]["message"].as_str().unwrap();
+                (refusal["index"].as_u64().unwrap(), message.to_owned())
+            };
+            answer["refusals"].as_array().unwrap().iter().map(row).collect::<Vec<_>>()
+        }
+    };
+    // The one that is there asks for nothing more, the third does not fit, and the last one does again.
+    let set = json!([
+        asking("old", "900m"),
+        asking("a", "400m"),
+        asking("b", "400m"),
+        asking("c", "300m"),
+        asking("d", "900m"),
+    ]);
+    let refusals = check(set).await;
+    assert_eq!(refusals.iter().map(|(index, _)| *index).collect::<Vec<_>>(), [2, 4]);
+    let (together, alone) = (&refusals[0].1, &refusals[1].1);
+    assert!(together.contains("700m are used and 300m are left"), "{together}");
+    assert!(together.contains("alone it would pass"), "{together}");
+    assert!(alone.contains("asks for 900m cpu") && !alone.contains("alone it"), "{alone}");
+    // A quota among them is stored before them; other namespaces have none.
+    let mut elsewhere = asking("e", "9");
+    elsewhere["metadata"]["namespace"] = "lab".into();
+    let raised = json!([
+        quota(json!({"hard": {"cpu": "2"}})),
+        asking("a", "800m"),
+        asking("b", "800m"),
+        elsewhere
+    ]);
+    assert_eq!(check(raised).await, []);
+
+    // A crowd that only asks takes nothing from one that means it.
+    let dry = format!("{TASKS}?dryRun=All");
+    let crowd = join_all((0..40).map(|i| {
+        let (admin, dry) = (&admin, &dry);
+        async move { send(admin, "POST", dry, asking(&format!("dry-{i}"), "700m")).await.0 }
+    }));
+    let meant = async {
+        for i in 0..20 {
+            let name = format!("meant-{i}");
+            assert_eq!(send(&admin, "POST", TASKS, asking(&name, "700m")).await.0, 201);
+            send(&admin, "DELETE", &format!("{TASKS}/{name}"), Value::Null).await;
+        }
+    };
+    let (codes, ()) = futures::future::join(crowd, meant).await;
+    assert!(codes.iter().all(|code| [201, 422].contains(code)), "{codes:?}");
+    cluster.running.shut_down().await.unwrap();
+}

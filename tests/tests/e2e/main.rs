@@ -15,6 +15,7 @@ mod poses;
 mod preemption;
 mod probes;
 mod quotas;
+mod reschedule;
 mod survival;
 mod tasksets;
 mod upkeep;

@@ -95,7 +95,8 @@ impl Workload {
             }
             (policy, _) => policy,
         };
-        self.desired.stop.is_none() && !self.forgotten && restart::restarts(policy, exit)
+        let may = self.desired.stop.is_none() && !self.forgotten;
+        may && !(self.has_failed(exit) && self.is_given_up()) && restart::restarts(policy, exit)
     }
 }
 

@@ -3,6 +3,7 @@
 pub mod config;
 pub mod depend;
 pub mod probe;
+pub mod reschedule;
 pub(super) mod rules;
 #[cfg(test)]
 mod tests;
@@ -15,6 +16,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 pub use config::{EnvFrom, EnvSource, Files};
+pub use reschedule::{EarlierTry, Outlook, Over, Reschedule};
 
 use super::node::{NodeKind, Taint, TaintEffect};
 use super::{KindInfo, admit_spec};
@@ -81,12 +83,17 @@ pub struct TaskSpec {
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub depends_on: Vec<depend::DependsOn>,
     /// How long the task may be on its node, seconds from when it was placed; then it is stopped, and has Failed with
-    /// the reason DeadlineExceeded. The controller keeps the time: a node without contact is told when it is back.
+    /// the reason DeadlineExceeded. The controller keeps the time: a node without contact is told when it is back. With
+    /// `reschedule` it counts from the first placement, over all nodes and the waits between them.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub active_deadline_seconds: Option<u32>,
     /// How long the object stays after the task has ended, seconds; none: until somebody deletes it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub ttl_seconds_after_finished: Option<u32>,
+    /// How it is tried on other nodes when it has failed on one; none: its first failure that `restartPolicy` does not
+    /// answer is its end.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub reschedule: Option<Reschedule>,
 }
 
 /// What a task that finds no room may do about it.
@@ -126,6 +133,9 @@ pub struct Placement {
     /// How far from it a robot may be, metres; the rim is inside. None: any distance.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub within: Option<f64>,
+    /// What happens when the robot leaves the radius while the task runs.
+    #[serde(skip_serializing_if = "OutOfRange::is_default")]
+    pub on_out_of_range: OutOfRange,
     /// Which kind of node.
     pub on: NodeChoice,
     /// Labels the node must have.
@@ -153,6 +163,22 @@ pub struct Placement {
     /// it: of two robots the fuller one, unless it is that much farther away. None: only of equally good ones.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub battery_cost: Option<f64>,
+}
+
+/// What happens to a placed task when its robot leaves the radius around the operation position.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+pub enum OutOfRange {
+    /// It goes on: the radius counts when the task is placed.
+    #[default]
+    Ignore,
+    /// It is ended, gracefully, and waits for another place under another uid. Not while the node has a mission lock.
+    Reschedule,
+}
+
+impl OutOfRange {
+    fn is_default(&self) -> bool {
+        *self == OutOfRange::default()
+    }
 }
 
 /// Which kind of node a task may run on.
@@ -548,6 +574,21 @@ pub struct TaskStatus {
     /// Number of the agent's newest report that is in here: reports are applied once.
     #[serde(skip_serializing_if = "is_zero")]
     pub report_sequence: u64,
+    /// How many attempts have failed on this node.
+    #[serde(skip_serializing_if = "is_none_yet")]
+    pub failed_attempts: u32,
+    /// The nodes that were tried before, the last one last; of many the newest ten.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub earlier: Vec<EarlierTry>,
+    /// How many attempts have failed on all nodes before this one.
+    #[serde(skip_serializing_if = "is_none_yet")]
+    pub attempts_used: u32,
+    /// When it was placed for the first time, where it has been on other nodes before.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub first_bound_at: Option<MicroTime>,
+    /// It is not placed before.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub not_before: Option<MicroTime>,
 }
 
 impl TaskStatus {
@@ -569,6 +610,11 @@ impl TaskStatus {
 
 #[expect(clippy::trivially_copy_pass_by_ref, reason = "serde passes references")]
 fn is_zero(n: &u64) -> bool {
+    *n == 0
+}
+
+#[expect(clippy::trivially_copy_pass_by_ref, reason = "serde passes references")]
+fn is_none_yet(n: &u32) -> bool {
     *n == 0
 }
 

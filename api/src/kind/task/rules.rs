@@ -17,6 +17,7 @@ pub(in crate::kind) fn rules(spec: &TaskSpec, violations: &mut Violations) {
     run_rules(&spec.run, violations);
     super::probe::rules(spec, violations);
     super::depend::rules(spec, violations);
+    super::reschedule::rules(spec, violations);
     if spec.run.executor.is_some() && spec.restart_policy != RestartPolicy::Never {
         violations
             .invalid("spec.restartPolicy", "an executor's work is not run again by itself")

@@ -177,3 +177,40 @@ fn only_what_runs_is_ready() {
     status.set_ready(None, time(5));
     assert_eq!(status.ready, None);
 }
+
+#[test]
+fn what_cannot_be_tried_elsewhere_is_refused() {
+    let tried = |policy: &str, reschedule: Value| {
+        problems(&sleep(json!({"restartPolicy": policy, "reschedule": reschedule})))
+    };
+    assert_eq!(tried("Never", json!({})), [""; 0]);
+    assert_eq!(tried("OnFailure", json!({"maxAttempts": 6, "attemptsPerNode": 3})), [""; 0]);
+    assert_eq!(
+        tried("Always", json!({"maxAttempts": 0, "backoff": "1h"})),
+        [
+            "spec.reschedule: a task that is always started again does not fail; set restartPolicy: OnFailure, or write a TaskSet with one replica",
+            "spec.reschedule.maxAttempts: 0 is not between 1 and 100; 1 lets it fail once",
+            "spec.reschedule.maxBackoff: 5m is less than the first wait, 1h; leave it out, or make it longer than `backoff`",
+        ]
+    );
+    assert_eq!(
+        tried("Never", json!({"attemptsPerNode": 2})),
+        [
+            "spec.reschedule.attemptsPerNode: with restartPolicy Never there is one attempt on a node; leave it out, or set restartPolicy: OnFailure"
+        ]
+    );
+    let work = json!({"run": {"executor": {"task": "e"}}, "reschedule": {}});
+    assert_eq!(
+        problems(&task(work)),
+        [
+            "spec.reschedule: an executor's work runs where its executor is; leave it out; give the executor's task one"
+        ]
+    );
+    let radius = json!({"placement": {"onOutOfRange": "Reschedule", "at": {"x": 1, "y": 2}}});
+    assert_eq!(
+        problems(&sleep(radius)),
+        [
+            "spec.placement.onOutOfRange: there is no radius to leave; give the operation position and the radius: at: {x: 3.0, y: 4.0}, within: 5"
+        ]
+    );
+}

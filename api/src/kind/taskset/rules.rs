@@ -4,7 +4,7 @@ use serde_json::Value;
 
 use super::{MAX_SET_NAME_LEN, REVISION_LABEL, SET_LABEL, TaskSetSpec, UnreachablePolicy};
 use crate::kind::admit_spec;
-use crate::kind::task::{RestartPolicy, rules as task_rules};
+use crate::kind::task::{RestartPolicy, TaskSpec, rules as task_rules};
 use crate::selector::check_labels;
 use crate::validate::{Violations, member_path};
 
@@ -88,7 +88,8 @@ fn selector_rules(spec: &TaskSetSpec, violations: &mut Violations) {
 fn template_rules(spec: &TaskSetSpec, violations: &mut Violations) {
     let template = &spec.template.spec;
     let mut of_task = Violations::new();
-    task_rules::rules(template, &mut of_task);
+    // What a template says of it is refused below, whatever it says.
+    task_rules::rules(&TaskSpec { reschedule: None, ..template.clone() }, &mut of_task);
     violations.extend(of_task.below("spec", "spec.template.spec"));
     if template.restart_policy != RestartPolicy::Always {
         violations
@@ -97,6 +98,14 @@ fn template_rules(spec: &TaskSetSpec, violations: &mut Violations) {
                 "a TaskSet keeps its tasks running, so they start again whenever they end",
             )
             .suggest("leave it out, or set Always; what should end once is a Task");
+    }
+    if template.reschedule.is_some() {
+        violations
+            .forbidden(
+                "spec.template.spec.reschedule",
+                "a TaskSet puts another task in the place of one that has ended, itself",
+            )
+            .suggest("leave it out");
     }
     let placement = &template.placement;
     if placement.prefer.is_some() {

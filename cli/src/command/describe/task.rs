@@ -3,12 +3,12 @@
 use jiff::Timestamp;
 use muster_api::kind::task::depend::DependsOn;
 use muster_api::kind::task::{
-    ContainerRun, EnvFrom, EnvVar, Files, Placement, ProcessRun, Resources, Task, TaskSpec,
-    TaskStatus,
+    ContainerRun, EnvFrom, EnvVar, Files, OutOfRange, Placement, ProcessRun, Reschedule, Resources,
+    Task, TaskSpec, TaskStatus,
 };
 
 use super::{begin, position, scored_by, when, which_node};
-use crate::command::why::refusal_table;
+use crate::command::why::{refusal_table, tries_table};
 use crate::output::columns::task as columns;
 use crate::output::human;
 use crate::output::sheet::Sheet;
@@ -24,6 +24,9 @@ pub(super) fn describe(sheet: &mut Sheet, task: &Task, now: Timestamp) {
     resources(sheet, &task.spec.resources, &status);
     program(sheet, &task.spec);
     super::probes::describe(sheet, &task.spec, &status);
+    if !status.earlier.is_empty() {
+        sheet.table("Tried before", tries_table(&status.earlier));
+    }
     if !status.why.is_empty() {
         sheet.table("Why it waits", refusal_table(&status.why));
     }
@@ -45,14 +48,25 @@ fn state(sheet: &mut Sheet, task: &Task, status: &TaskStatus, now: Timestamp) {
     let cost = task.spec.placement.cost;
     sheet.maybe("Score", status.score.map(|s| columns::score(s, cost)));
     sheet.maybe("Lease", status.lease.as_ref().map(|l| format!("{}, epoch {}", l.name, l.epoch)));
-    if status.attempt > 0 {
-        sheet.field("Attempt", status.attempt.to_string());
-    }
+    sheet.maybe("Attempt", some(&columns::attempts(&task.spec, status)));
+    let reschedule = task.spec.reschedule.as_ref();
+    sheet.maybe("Tried elsewhere", reschedule.map(tried_elsewhere));
+    sheet.maybe("Not before", status.not_before.as_ref().map(|t| when(t.0, now)));
     sheet.maybe("Placed", status.bound_at.as_ref().map(|t| when(t.0, now)));
     sheet.maybe("Ready", ready(status));
     sheet.maybe("Started", status.started_at.as_ref().map(|t| when(t.0, now)));
     sheet.maybe("Ended", status.finished_at.as_ref().map(|t| when(t.0, now)));
     sheet.maybe("Exit", some(&columns::exit(status)));
+}
+
+/// `up to 3 attempts, after 10s, doubled up to 5m`.
+fn tried_elsewhere(block: &Reschedule) -> String {
+    let Reschedule { max_attempts, attempts_per_node, backoff, max_backoff } = block;
+    let each = match attempts_per_node {
+        1 => String::new(),
+        n => format!(", {n} on a node"),
+    };
+    format!("up to {max_attempts} attempts{each}, after {backoff}, doubled up to {max_backoff}")
 }
 
 /// `camera (Ready, restarts with it)`.
@@ -73,6 +87,9 @@ fn placement(sheet: &mut Sheet, placement: &Placement) {
         let mut text = position(at);
         if let Some(within) = placement.within {
             text.push_str(&format!(", within {within} m"));
+        }
+        if placement.on_out_of_range == OutOfRange::Reschedule {
+            text.push_str("; is placed anew when its robot leaves it");
         }
         sheet.field("At", text);
         sheet.field("Scored by", scored_by(placement.cost));

@@ -5,7 +5,7 @@ mod framework;
 mod task;
 mod taskset;
 
-use muster_api::kind::task::NodeRefusal;
+use muster_api::kind::task::{EarlierTry, NodeRefusal};
 use muster_api::kind::taskset::SET_LABEL;
 use serde::Deserialize;
 use serde_json::Value;
@@ -122,6 +122,21 @@ pub(crate) fn refusal_table(why: &[NodeRefusal]) -> Table {
     for refusal in why {
         let node = if refusal.node.is_empty() { "(all)" } else { &refusal.node };
         table.push([node, refusal.reason.as_str(), refusal.message.as_str()]);
+    }
+    table
+}
+
+/// The nodes that a task was on before, and how that ended.
+pub(crate) fn tries_table(earlier: &[EarlierTry]) -> Table {
+    let mut table = Table::new(["NODE", "ATTEMPTS", "REASON", "EXIT", "MESSAGE"]);
+    for one in earlier {
+        let exit = match (one.signal, one.exit_code) {
+            (Some(signal), _) => format!("signal {signal}"),
+            (None, Some(code)) => code.to_string(),
+            (None, None) => String::new(),
+        };
+        let attempts = one.attempts.to_string();
+        table.push([&one.node, &attempts, &one.reason, &exit, &one.message].map(String::as_str));
     }
     table
 }

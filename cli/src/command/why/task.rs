@@ -4,7 +4,7 @@ use muster_api::kind::task::{Cost, NodeRefusal, Task, TaskStatus};
 use muster_api::phase::TaskPhase;
 use serde_json::{Value, json};
 
-use super::{Asked, advice, refusals_and_hints};
+use super::{Asked, advice, refusals_and_hints, tries_table};
 use crate::output::columns::task as columns;
 use crate::output::human;
 use crate::output::style::Styles;
@@ -41,6 +41,12 @@ fn story(name: &str, task: &Task, why: &[NodeRefusal], styles: &Styles) -> Strin
             }
         }
     }
+    if !status.earlier.is_empty() {
+        text.push_str(&format!(
+            "\nIt was tried before:\n{}",
+            tries_table(&status.earlier).text(styles)
+        ));
+    }
     text
 }
 
@@ -55,9 +61,10 @@ fn headline(name: &str, status: &TaskStatus) -> String {
     let reason = Some(status.reason.as_str()).filter(|r| !r.is_empty());
     let because = reason.map(|r| format!(" ({r})")).unwrap_or_default();
     match status.phase {
-        TaskPhase::Pending => {
-            format!("task/{name} waits: no node takes it now.")
-        }
+        TaskPhase::Pending => match status.why.iter().find(|w| w.reason == "BackOff") {
+            Some(hold) => format!("task/{name} waits: it {}.", hold.message),
+            None => format!("task/{name} waits: no node takes it now."),
+        },
         TaskPhase::Bound => {
             format!(
                 "task/{name} is placed on {node}{}; its agent has not started it yet{because}.",

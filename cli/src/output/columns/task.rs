@@ -15,9 +15,7 @@ pub(super) const COLUMNS: &[Column<Task>] = &[
         status(task, |s| s.score.map(|v| score(v, task.spec.placement.cost)).unwrap_or_default())
     }),
     Column::new("CLASS", |task, _| task.spec.resources.class().into()),
-    Column::new("ATTEMPT", |task, _| {
-        status(task, |s| if s.attempt == 0 { String::new() } else { s.attempt.to_string() })
-    }),
+    Column::new("ATTEMPT", |task, _| status(task, |s| attempts(&task.spec, s))),
     Column::new("AGE", |task, now| age(task.metadata.creation_timestamp.as_ref(), now)),
     Column::new("REASON", |task, _| status(task, reason)),
     Column::wide("READY", |task, _| status(task, |s| ready(s).unwrap_or_default().to_owned())),
@@ -55,6 +53,16 @@ pub(crate) fn ready(status: &TaskStatus) -> Option<&'static str> {
 fn phase(task: &Task) -> Cell {
     let phase = task.status.as_ref().map(|s| s.phase).unwrap_or_default();
     Cell::new(phase.as_str(), mood(phase))
+}
+
+/// Which attempt it is; of a task that is tried on other nodes counted over all of them, and how many there may be.
+pub(crate) fn attempts(spec: &TaskSpec, status: &TaskStatus) -> String {
+    let attempt = status.attempts_used.saturating_add(status.attempt);
+    match (&spec.reschedule, attempt) {
+        (_, 0) => String::new(),
+        (Some(block), _) => format!("{attempt}/{}", block.max_attempts),
+        (None, _) => attempt.to_string(),
+    }
 }
 
 /// A score with its unit.

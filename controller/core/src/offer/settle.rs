@@ -224,6 +224,7 @@ fn reserve(
         title: Arc::clone(&launch.title),
         spec: Arc::clone(&launch.spec),
         since: 0,
+        avoid: Arc::default(),
     };
     let member = cluster.at(slot);
     if let Some(refusal) = filter::refusal(member, &demand) {

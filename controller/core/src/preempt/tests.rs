@@ -19,7 +19,7 @@ fn demand(uid: &str, priority: i32, cpu: u64, drives: bool) -> Demand {
     });
     let spec: TaskSpec = serde_json::from_value(spec).expect("a spec");
     let title = format!("default/{uid}").into();
-    Demand { uid: TaskUid::new(uid), title, spec: Arc::new(spec), since: 0 }
+    Demand { uid: TaskUid::new(uid), title, spec: Arc::new(spec), since: 0, avoid: Arc::default() }
 }
 
 fn cluster(robots: &[(&str, u64)]) -> Cluster {

@@ -6,8 +6,8 @@
 //!
 //! Order of tasks: priority, then who waited longest. Order of nodes: a task that needs computation
 //! only tries the cloud first; robots by score where there is an operation position; else by fuller battery and most
-//! free CR. Nodes with a taint of effect PreferNoSchedule come last. A task that has no place may make room: see
-//! [`crate::preempt`].
+//! free CR. Nodes with a taint of effect PreferNoSchedule come after those, and nodes that the task has failed on last. A
+//! task that has no place may make room: see [`crate::preempt`].
 
 pub mod filter;
 pub mod score;
@@ -37,6 +37,8 @@ pub struct Demand {
     pub spec: Arc<TaskSpec>,
     /// When it was created, by [`since`]: who waits longest comes first.
     pub since: u64,
+    /// Nodes that it has failed on: they come last.
+    pub avoid: Arc<[NodeName]>,
 }
 
 /// The order of creation: by time, which an object tells in seconds since 1970, and in a second by the store's revision.
@@ -219,6 +221,7 @@ fn asks_the_same(a: &Demand, b: &Demand) -> bool {
         && one.preemption == other.preemption
         && one.placement == other.placement
         && one.run.container.is_some() == other.run.container.is_some()
+        && a.avoid == b.avoid
         && one.run.executor.is_none()
         && other.run.executor.is_none()
         && (one.placement.apart.is_none() || namespace_of(&a.title) == namespace_of(&b.title))
@@ -262,7 +265,7 @@ fn choose(cluster: &Cluster, demand: &Demand) -> Option<Slot> {
         }
     }
     if !spec.allows_kind(NodeKind::Robot) {
-        return second_best;
+        return second_best.map(|(_, slot)| slot);
     }
     let robot = match (&spec.placement.at, spec.placement.cost) {
         (None, _) => first_fit(cluster, demand, cluster.by_free(NodeKind::Robot), &mut second_best),
@@ -273,22 +276,50 @@ fn choose(cluster: &Cluster, demand: &Demand) -> Option<Slot> {
             best_scored(cluster, demand, &mut second_best)
         }
     };
-    robot.or(second_best)
+    robot.or(second_best.map(|(_, slot)| slot))
 }
 
 /// The node that the task asks to be tried first, when it takes the task.
 fn preferred(cluster: &Cluster, demand: &Demand) -> Option<Slot> {
     let slot = cluster.slot_of(demand.spec.placement.prefer.as_deref()?)?;
-    filter::refusal(cluster.at(slot), demand).is_none().then_some(slot)
+    let takes = filter::refusal(cluster.at(slot), demand).is_none();
+    (takes && !has_failed_on(cluster, demand, slot)).then_some(slot)
 }
 
-/// Whether a taint asks to leave the node for last.
-fn is_last_resort(cluster: &Cluster, demand: &Demand, slot: Slot) -> bool {
-    let Some(facts) = &cluster.at(slot).facts else { return false };
+/// Why a node is left for later, the better first.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+enum Resort {
+    /// A taint asks for it.
+    Tainted,
+    /// The task has failed there.
+    Failed,
+}
+
+/// The best of the nodes that are left for later.
+type SecondBest = Option<(Resort, Slot)>;
+
+fn has_failed_on(cluster: &Cluster, demand: &Demand, slot: Slot) -> bool {
+    demand.avoid.contains(&cluster.at(slot).name)
+}
+
+/// Why a node that takes the task is left for later; none: it is not.
+fn resort(cluster: &Cluster, demand: &Demand, slot: Slot) -> Option<Resort> {
+    if has_failed_on(cluster, demand, slot) {
+        return Some(Resort::Failed);
+    }
+    let facts = cluster.at(slot).facts.as_ref()?;
     let tolerations = &demand.spec.placement.tolerations;
-    facts.taints.iter().any(|t| {
+    let tainted = facts.taints.iter().any(|t| {
         t.effect == TaintEffect::PreferNoSchedule && !tolerations.iter().any(|o| o.tolerates(t))
-    })
+    });
+    tainted.then_some(Resort::Tainted)
+}
+
+/// Keeps a node for later, if it is better than what is kept.
+fn keep(second_best: &mut SecondBest, resort: Resort, slot: Slot) {
+    if second_best.is_none_or(|(kept, _)| resort < kept) {
+        *second_best = Some((resort, slot));
+    }
 }
 
 /// The first of `slots` that takes the task; one that should be left for last goes to `second_best`.
@@ -296,16 +327,16 @@ fn first_fit(
     cluster: &Cluster,
     demand: &Demand,
     slots: impl Iterator<Item = Slot>,
-    second_best: &mut Option<Slot>,
+    second_best: &mut SecondBest,
 ) -> Option<Slot> {
     for slot in slots {
         if filter::refusal(cluster.at(slot), demand).is_some() {
             continue;
         }
-        if !is_last_resort(cluster, demand, slot) {
-            return Some(slot);
+        match resort(cluster, demand, slot) {
+            None => return Some(slot),
+            Some(resort) => keep(second_best, resort, slot),
         }
-        second_best.get_or_insert(slot);
     }
     None
 }
@@ -318,7 +349,7 @@ fn rank(cluster: &Cluster, slot: Slot) -> (u8, std::cmp::Reverse<u64>) {
 }
 
 /// The nearest robot that takes the task; of equally near ones the better by [`rank`].
-fn nearest_fit(cluster: &Cluster, demand: &Demand, second_best: &mut Option<Slot>) -> Option<Slot> {
+fn nearest_fit(cluster: &Cluster, demand: &Demand, second_best: &mut SecondBest) -> Option<Slot> {
     let at = demand.spec.placement.at.as_ref()?;
     let radius = demand.spec.placement.within.unwrap_or(f64::INFINITY);
     let mut best: Option<(f64, Slot)> = None;
@@ -329,8 +360,8 @@ fn nearest_fit(cluster: &Cluster, demand: &Demand, second_best: &mut Option<Slot
         if filter::refusal(cluster.at(found.slot), demand).is_some() {
             continue;
         }
-        if is_last_resort(cluster, demand, found.slot) {
-            second_best.get_or_insert(found.slot);
+        if let Some(resort) = resort(cluster, demand, found.slot) {
+            keep(second_best, resort, found.slot);
             continue;
         }
         if best.is_none_or(|(_, slot)| rank(cluster, found.slot) < rank(cluster, slot)) {
@@ -341,7 +372,7 @@ fn nearest_fit(cluster: &Cluster, demand: &Demand, second_best: &mut Option<Slot
 }
 
 /// The robot with the lowest score, where the order of scores is not that of distances.
-fn best_scored(cluster: &Cluster, demand: &Demand, second_best: &mut Option<Slot>) -> Option<Slot> {
+fn best_scored(cluster: &Cluster, demand: &Demand, second_best: &mut SecondBest) -> Option<Slot> {
     let at = demand.spec.placement.at.as_ref()?;
     let radius = demand.spec.placement.within.unwrap_or(f64::INFINITY);
     let mut scored: Vec<_> = cluster

@@ -24,6 +24,7 @@ fn demand(uid: &str, mut spec: serde_json::Value) -> Demand {
         title: format!("default/{uid}").into(),
         spec: Arc::new(serde_json::from_value(spec).expect("a spec")),
         since: 0,
+        avoid: Arc::default(),
     }
 }
 
@@ -282,6 +283,91 @@ proptest! {
             for (_, member) in cluster.members() {
                 prop_assert!(member.ledger.used().cpu <= member.ledger.allocatable().cpu);
             }
+        }
+    }
+}
+
+fn avoiding(nodes: &[&str], spec: serde_json::Value) -> Demand {
+    Demand { avoid: nodes.iter().map(|node| name(node)).collect(), ..demand("t", spec) }
+}
+
+#[test]
+fn a_node_that_the_task_failed_on_comes_last_and_is_not_refused() {
+    use muster_api::kind::node::Taint;
+    let mut tainted = node(Robot, 1000, Some((3.0, 0.0)));
+    tainted.spec.taints = vec![Taint {
+        key: "old".to_owned(),
+        value: String::new(),
+        effect: TaintEffect::PreferNoSchedule,
+    }];
+    let nodes = [
+        ("near", node(Robot, 1000, Some((1.0, 0.0)))),
+        ("far", node(Robot, 1000, Some((2.0, 0.0)))),
+        ("tainted", tainted),
+    ];
+    for cost in ["Distance", "TravelTime"] {
+        let spec = || {
+            json!({"placement": {"at": {"x": 0.0, "y": 0.0}, "prefer": "near", "cost": cost},
+                   "resources": {"sensors": ["kinect:ImageGen"]}})
+        };
+        let goes_to = |avoid: &[&str]| {
+            let mut nodes = nodes.clone();
+            nodes.iter_mut().for_each(|(_, node)| node.spec.speed = Some(1.0));
+            let plan = schedule(&mut cluster(&nodes), &mut [avoiding(avoid, spec())]);
+            plan.binds[0].node.to_string()
+        };
+        assert_eq!(goes_to(&[]), "near", "{cost}");
+        assert_eq!(goes_to(&["near"]), "far", "{cost}");
+        assert_eq!(goes_to(&["near", "far"]), "tainted", "a taint is less than a failure, {cost}");
+        assert_eq!(goes_to(&["near", "far", "tainted"]), "near", "all have failed, {cost}");
+    }
+    let pinned = json!({"placement": {"node": "near"}});
+    let plan = schedule(&mut cluster(&nodes), &mut [avoiding(&["near"], pinned)]);
+    assert_eq!(bound(&plan), [("t", "near")]);
+    let clouds = [("c1", node(Cloud, 1000, None)), ("r1", node(Robot, 1000, Some((0.0, 0.0))))];
+    let compute = json!({"resources": {"cpu": 1}});
+    let plan = schedule(&mut cluster(&clouds), &mut [avoiding(&["c1"], compute)]);
+    assert_eq!(
+        bound(&plan),
+        [("t", "r1")],
+        "a robot that was not tried, before the cloud that was"
+    );
+}
+
+proptest! {
+    #[test]
+    fn a_node_that_failed_is_taken_only_when_no_other_takes_the_task(
+        nodes in proptest::collection::vec((any::<bool>(), 0..10_u64, -9..9_i32, any::<bool>()), 1..12),
+        at in proptest::option::of(-9..9_i32),
+        cpu in 1..8_u64,
+    ) {
+        let mut cluster = Cluster::new();
+        let mut avoid = Vec::new();
+        for (i, (robot, cpu, x, failed)) in nodes.into_iter().enumerate() {
+            let kind = if robot { Robot } else { Cloud };
+            let node_name = format!("n{i}");
+            let node = node(kind, cpu * 100, robot.then_some((f64::from(x), 0.0)));
+            cluster.upsert_node(&name(&node_name), &node);
+            if failed {
+                avoid.push(node_name);
+            }
+        }
+        let mut spec = json!({"resources": {"cpu": format!("{}m", cpu * 100)}});
+        if let Some(x) = at {
+            spec["placement"] = json!({"at": {"x": x, "y": 0}, "within": 6});
+        }
+        let avoid: Vec<&str> = avoid.iter().map(String::as_str).collect();
+        let demand = avoiding(&avoid, spec);
+        let takes = |avoided: bool| {
+            cluster.members().any(|(_, member)| {
+                filter::refusal(member, &demand).is_none() && avoid.contains(&member.name.as_str()) == avoided
+            })
+        };
+        let (others, failed) = (takes(false), takes(true));
+        let plan = schedule(&mut cluster.clone(), &mut [demand.clone()]);
+        match plan.binds.first() {
+            Some(bind) => prop_assert_eq!(avoid.contains(&bind.node.as_str()), !others),
+            None => prop_assert!(!others && !failed),
         }
     }
 }

@@ -8,6 +8,7 @@ use std::fmt;
 use std::time::Duration;
 
 use jiff::Timestamp;
+use muster_api::kind::task::reschedule::OUT_OF_RANGE;
 use muster_api::kind::task::{DEADLINE_EXCEEDED, NODE_MAINTENANCE, PREEMPTED, PREEMPTING};
 use muster_api::phase::TaskPhase;
 
@@ -100,8 +101,9 @@ impl fmt::Display for Fault {
 }
 
 /// Ends that say nothing about the template: somebody else brought them about.
-const NOT_ITS_FAULT: [&str; 10] = [
+const NOT_ITS_FAULT: [&str; 11] = [
     PREEMPTED,
+    OUT_OF_RANGE,
     NODE_MAINTENANCE,
     DEADLINE_EXCEEDED,
     "NodeFenced",

@@ -1,13 +1,18 @@
 //! Tasks that are not considered for a place, whatever the nodes are like: see [`muster_controller_core::hold`]. Looked at
-//! again when the task changes, or something that it names: a ConfigMap, a Secret, another task.
+//! again when the task changes, or something that it names (a ConfigMap, a Secret, another task), or when it has waited
+//! long enough after it failed elsewhere.
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
 
+use jiff::Timestamp;
 use muster_api::id::TaskUid;
-use muster_api::kind::task::{NodeRefusal, TaskSpec};
+use muster_api::kind::task::{NodeRefusal, TaskSpec, TaskStatus};
 use muster_controller_core::hold::Hold;
+use muster_controller_core::reschedule;
 use muster_controller_core::schedule::Wait;
+
+use tokio::time::Instant;
 
 use super::{Scheduler, Waiting};
 use crate::store::Key;
@@ -15,12 +20,34 @@ use crate::{configs, depends};
 
 impl Scheduler {
     /// Why a task is not considered for a place, by what the store says now.
-    pub(super) fn holds(&self, key: &Key, spec: &TaskSpec) -> Arc<[NodeRefusal]> {
+    pub(super) fn holds(
+        &self,
+        key: &Key,
+        spec: &TaskSpec,
+        past: Option<&TaskStatus>,
+    ) -> Arc<[NodeRefusal]> {
         let namespace = key.namespace().unwrap_or_default();
         let store = &self.context.store;
         let others = depends::holds(store, namespace, spec);
         let configs = configs::holds(store, namespace, spec);
-        others.iter().chain(&configs).map(Hold::refusal).collect()
+        let now = self.context.clock.now();
+        let rests = past.and_then(|past| reschedule::hold(spec, past, now));
+        let tried = past.filter(|_| rests.is_some()).map(reschedule::refusals);
+        let holds = rests.iter().chain(&others).chain(&configs).map(Hold::refusal);
+        holds.chain(tried.into_iter().flatten()).collect()
+    }
+
+    /// Looks again at the tasks that have waited long enough. Says when the next one has.
+    pub(super) fn wake_rested(&mut self) -> Option<Instant> {
+        let now = self.context.clock.now();
+        let mut due = BTreeSet::new();
+        while self.resting.first().is_some_and(|(until, _)| *until <= now) {
+            due.extend(self.resting.pop_first().map(|(_, uid)| uid));
+        }
+        self.look_again_at(due);
+        let (until, _) = self.resting.first()?;
+        // The clock of the machine may have been set back: an early look is a look for nothing.
+        Some(Instant::now() + until.duration_since(now).unsigned_abs())
     }
 
     /// What waiting tasks name has changed.
@@ -42,7 +69,8 @@ impl Scheduler {
     fn look_again_at(&mut self, uids: BTreeSet<TaskUid>) {
         for uid in uids {
             let Some(waiting) = self.waiting.get(&uid) else { continue };
-            let holds = self.holds(&waiting.stored.key, &waiting.demand.spec);
+            let Waiting { stored, demand, past, .. } = waiting;
+            let holds = self.holds(&stored.key, &demand.spec, past.as_deref());
             if !holds.is_empty() {
                 self.cluster.unnominate(&uid);
             }
@@ -80,4 +108,9 @@ impl Scheduler {
         let held = self.waiting.values().filter(|w| !w.holds.is_empty());
         held.map(|w| Wait { uid: w.demand.uid.clone(), why: Arc::clone(&w.holds) })
     }
+}
+
+/// Until when a task that was tried before is held back.
+pub(super) fn resting_until(past: Option<&TaskStatus>) -> Option<Timestamp> {
+    past?.not_before.as_ref().map(|at| at.0)
 }

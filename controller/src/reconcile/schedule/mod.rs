@@ -18,17 +18,19 @@ use std::collections::{BTreeSet, HashMap, HashSet};
 use std::sync::Arc;
 use std::time::Duration;
 
+use jiff::Timestamp;
 use muster_api::id::TaskUid;
 use muster_api::kind::lease::Lease;
 use muster_api::kind::node::Node;
 use muster_api::kind::quota::Quota;
-use muster_api::kind::task::{NodeRefusal, Task, TaskSpec};
+use muster_api::kind::task::{NodeRefusal, Task, TaskSpec, TaskStatus};
 use muster_api::name::NodeName;
 use muster_api::phase::TaskPhase;
 use muster_controller_core::cluster::{Cluster, Executor};
 use muster_controller_core::fairness::Accounts;
 use muster_controller_core::ledger::Reservation;
 use muster_controller_core::recent::Recent;
+use muster_controller_core::reschedule;
 use muster_controller_core::schedule::{self, Demand};
 use tokio::sync::{mpsc, oneshot};
 use tokio::time::Instant;
@@ -43,6 +45,7 @@ use crate::context::Context;
 use crate::objects::{self, LEASES, NODES, QUOTAS, TASKS};
 use crate::session::poses::LivePoses;
 use crate::store::{Change, Event, Key, Stored, Watcher};
+use holds::resting_until;
 
 /// How often changed numbers in a waiting task's reasons are written. New reasons are written at
 /// once; a reason whose numbers move with every bind would write without end.
@@ -127,6 +130,8 @@ struct Waiting {
     /// What its status says.
     written: Arc<[NodeRefusal]>,
     written_at: Instant,
+    /// What its status says of nodes that were tried before; none: nothing.
+    past: Option<Box<TaskStatus>>,
 }
 
 /// The one task that places tasks.
@@ -142,6 +147,8 @@ pub struct Scheduler {
     waiting: HashMap<TaskUid, Waiting>,
     /// Who waited for a task when it was looked at last, by that task's key.
     dependents: HashMap<Key, BTreeSet<TaskUid>>,
+    /// Tasks that are held back until a time.
+    resting: BTreeSet<(Timestamp, TaskUid)>,
     /// When waiting tasks are looked at again even if nothing changes.
     look_again: Option<Instant>,
     /// The store failed: robots that move are no reason to try again before.
@@ -172,6 +179,7 @@ impl Scheduler {
             moves: Moves::new(poses),
             waiting: HashMap::new(),
             dependents: HashMap::new(),
+            resting: BTreeSet::new(),
             look_again: None,
             binds_after: None,
             specs: Recent::default(),
@@ -226,6 +234,7 @@ impl Scheduler {
         self.desk.begin_anew();
         self.waiting.clear();
         self.dependents.clear();
+        self.resting.clear();
         self.own.clear();
         for resource in [QUOTAS, NODES, LEASES] {
             for stored in self.context.store.list(resource, None).items {
@@ -339,7 +348,7 @@ impl Scheduler {
             return;
         };
         let status = task.status.unwrap_or_default();
-        match (status.phase, status.node) {
+        match (status.phase, status.node.as_deref()) {
             // An old event, from before it was bound: nothing goes back to Pending.
             (TaskPhase::Pending, _) if self.cluster.node_of(&uid).is_some() => {}
             (TaskPhase::Pending, _) if task.metadata.deletion_timestamp.is_none() => {
@@ -349,14 +358,18 @@ impl Scheduler {
                 let since = self.waiting.get(&uid).map_or_else(fresh, |w| w.demand.since);
                 let title =
                     format!("{}/{}", stored.key.namespace().unwrap_or_default(), stored.key.name);
+                let avoid = reschedule::avoided(&status).filter_map(|n| NodeName::new(n).ok());
                 let demand = Demand {
                     uid: uid.clone(),
                     title: title.into(),
                     spec: self.specs.share(task.spec),
                     since,
+                    avoid: avoid.collect(),
                 };
                 self.take_in_dependencies(&uid, &stored.key, &demand.spec);
-                let holds = self.holds(&stored.key, &demand.spec);
+                let past = (!status.earlier.is_empty()).then(|| Box::new(status.carried()));
+                let holds = self.holds(&stored.key, &demand.spec, past.as_deref());
+                self.resting.extend(resting_until(past.as_deref()).map(|at| (at, uid.clone())));
                 if holds.is_empty() {
                     self.take_in_nomination(&demand, status.nominated_node);
                 } else {
@@ -373,6 +386,7 @@ impl Scheduler {
                         holds,
                         written: status.why.into(),
                         written_at,
+                        past,
                     },
                 );
             }
@@ -449,6 +463,7 @@ impl Scheduler {
     /// Decides for everything that waits, and carries it out.
     async fn decide(&mut self) {
         self.look_again = None;
+        let rested = self.wake_rested();
         if !self.waiting.is_empty() {
             let mut demands: Vec<Demand> = self.placeable().map(|w| w.demand.clone()).collect();
             let mut plan = schedule::schedule(&mut self.cluster, &mut demands);
@@ -456,7 +471,7 @@ impl Scheduler {
             let binds = self.bind_all(plan.binds).await;
             let preempted = self.preempt_all(plan.preemptions).await;
             let waits = self.write_reasons(plan.waits).await;
-            self.look_again = soonest([binds, preempted, waits]);
+            self.look_again = soonest([binds, preempted, waits, rested]);
         }
     }
 

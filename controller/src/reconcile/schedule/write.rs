@@ -131,7 +131,8 @@ impl Scheduler {
     fn bind_ops(&self, bind: &Bind) -> Option<Vec<Op>> {
         let waiting = self.waiting.get(&bind.uid)?;
         let now = self.context.clock.now();
-        let mut ops = vec![Op::status(&waiting.stored, &bind::status(bind, now))];
+        let status = bind::status(bind, waiting.past.as_deref(), now);
+        let mut ops = vec![Op::status(&waiting.stored, &status)];
         ops.extend(bind::grants(&self.context, bind, &waiting.stored.key, now));
         Some(ops)
     }
@@ -154,12 +155,12 @@ impl Scheduler {
                 later = Some(later.map_or(at, |l: Instant| l.min(at)));
                 continue;
             }
-            due.push((Arc::clone(&waiting.stored), uid, why));
+            // As in a bind: a task that waits has nothing else in its status.
+            let status = waiting_status(&why, waiting.past.as_deref());
+            due.push((Arc::clone(&waiting.stored), uid, why, status));
         }
         let store = &self.context.store;
-        let written = join_all(due.into_iter().map(|(stored, uid, why)| async move {
-            // As in a bind: a task that waits has nothing else in its status.
-            let status = waiting_status(&why);
+        let written = join_all(due.into_iter().map(|(stored, uid, why, status)| async move {
             (store.apply_one(Op::status(&stored, &status)).await, uid, why)
         }))
         .await;
@@ -185,14 +186,14 @@ impl Scheduler {
 }
 
 /// The status of a task that waits for these reasons.
-fn waiting_status(why: &[NodeRefusal]) -> TaskStatus {
+fn waiting_status(why: &[NodeRefusal], past: Option<&TaskStatus>) -> TaskStatus {
     let preempting = why.iter().find(|w| w.reason == PREEMPTING);
     TaskStatus {
         reason: preempting.map_or("Unschedulable", |_| PREEMPTING).to_owned(),
         message: preempting.map_or_else(|| headline(why), |w| format!("{}: {}", w.node, w.message)),
         nominated_node: preempting.map(|w| w.node.clone()),
         why: why.to_vec(),
-        ..TaskStatus::default()
+        ..past.map(TaskStatus::carried).unwrap_or_default()
     }
 }
 
@@ -206,15 +207,16 @@ fn same_reasons(a: &[NodeRefusal], b: &[NodeRefusal]) -> bool {
 
 /// The reasons in one line: how many nodes say what.
 fn headline(why: &[NodeRefusal]) -> String {
+    // What holds it back comes before what is said of nodes.
+    if let Some(hold) = why.first().filter(|w| w.node.is_empty()) {
+        return hold.message.clone();
+    }
     let mut counts: Vec<(&str, usize)> = Vec::new();
     for refusal in why.iter().filter(|w| !w.node.is_empty()) {
         match counts.iter_mut().find(|(reason, _)| *reason == refusal.reason) {
             Some((_, n)) => *n += 1,
             None => counts.push((&refusal.reason, 1)),
         }
-    }
-    if counts.is_empty() {
-        return why.first().map(|w| w.message.clone()).unwrap_or_default();
     }
     let parts: Vec<String> = counts.iter().map(|(reason, n)| format!("{n} {reason}")).collect();
     format!("no node takes it: {}", parts.join(", "))

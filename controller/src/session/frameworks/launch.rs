@@ -133,6 +133,13 @@ fn task_of(
             "is set by the offer that the launch uses; leave it out".to_owned(),
         ));
     }
+    if task.spec.reschedule.is_some() {
+        return Err(wrong(
+            "spec.reschedule",
+            "where a framework's task is tried again is the framework's to decide; leave it out"
+                .to_owned(),
+        ));
+    }
     let pass = create::pass(context, TASKS, &object).map_err(refused)?;
     Ok((object, task, pass))
 }

@@ -59,7 +59,8 @@ impl Default for LivePoses {
 }
 
 impl LivePoses {
-    fn now(&self) -> Monotonic {
+    /// The time that poses are stamped with when they come.
+    pub(crate) fn now(&self) -> Monotonic {
         self.started.elapsed()
     }
 
