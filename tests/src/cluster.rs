@@ -245,6 +245,17 @@ impl Cluster {
         self.client().await.request(request).await.expect("the controller answers")
     }
 
+    /// A counter of the controller, of all its labels together; 0: it has not counted yet.
+    pub async fn counter(&self, name: &str) -> u64 {
+        let request = Request::get("/metrics").body(Vec::new()).expect("a request");
+        let text = self.client().await.request_text(request).await.expect("metrics");
+        let own = text.lines().filter(|line| {
+            line.strip_prefix(name).is_some_and(|rest| rest.starts_with(['{', ' ']))
+        });
+        let values = own.filter_map(|line| line.rsplit(' ').next()?.parse::<u64>().ok());
+        values.sum()
+    }
+
     /// The log of a task of the default namespace.
     pub async fn task_log(&self, task: &str) -> String {
         let request = Request::get(format!("{API}/namespaces/default/tasks/{task}/log"));

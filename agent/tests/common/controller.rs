@@ -248,7 +248,7 @@ impl Controller {
     /// Says something to an executor, as its framework would.
     pub fn message(&self, executor: &str, data: Vec<u8>) {
         let executor = executor.to_owned();
-        self.say(Say::Message(proto::Message { executor, data: data.into() }));
+        self.say(Say::Message(proto::Message { executor, data: data.into(), mark: 0 }));
     }
 
     /// What executors said to frameworks.

@@ -1,8 +1,9 @@
-//! How messages with values of ConfigMaps and Secrets are shown in logs: by name and size.
+//! How messages with values of ConfigMaps and Secrets are shown in logs: by name and size; and tickets: by executor.
 
 use std::fmt;
 
-use super::agent::v1::{File, Variable};
+use super::agent::v1::{File, Ticket, Variable};
+use super::framework::v1::Direct;
 
 impl fmt::Debug for Variable {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -22,6 +23,26 @@ impl fmt::Debug for File {
     }
 }
 
+impl fmt::Debug for Ticket {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let revoked = self.secret.is_empty();
+        f.debug_struct("Ticket")
+            .field("executor", &self.executor)
+            .field("revoked", &revoked)
+            .finish_non_exhaustive()
+    }
+}
+
+impl fmt::Debug for Direct {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Direct")
+            .field("executor", &self.executor)
+            .field("address", &self.address)
+            .field("withdrawn", &self.ticket.is_empty())
+            .finish_non_exhaustive()
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -30,8 +51,10 @@ mod tests {
     fn values_are_not_shown() {
         let variable = Variable { name: "TOKEN".to_owned(), value: "hunter2".to_owned() };
         let file = File { data: "hunter2".into(), path: "key".to_owned(), ..File::default() };
-        let shown = format!("{variable:?} {file:?}");
+        let ticket = Ticket { executor: "e-1".to_owned(), secret: b"hunter2".to_vec() };
+        let direct = Direct { ticket: b"hunter2".as_slice().into(), ..Direct::default() };
+        let shown = format!("{variable:?} {file:?} {ticket:?} {direct:?}");
         assert!(shown.contains("TOKEN") && shown.contains("key"), "{shown}");
-        assert!(!shown.contains("hunter2"), "{shown}");
+        assert!(!shown.contains("hunter2") && !shown.contains("104, 117"), "{shown}");
     }
 }

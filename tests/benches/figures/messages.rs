@@ -1,8 +1,9 @@
 //! Framework → executor → framework, against a raw echo over TCP on loopback.
 //!
 //! ```text
-//!   floor:  client ⇄ TCP ⇄ echo                                                    2 sockets
-//!   ours:   framework ⇄ TLS, HTTP/2 ⇄ controller ⇄ TLS, HTTP/2 ⇄ agent ⇄ executor  6 sockets
+//!   floor:    client ⇄ TCP ⇄ echo                                                    2 sockets
+//!   directly: framework ⇄ TLS ⇄ agent ⇄ executor                                     4 sockets
+//!   relayed:  framework ⇄ TLS, HTTP/2 ⇄ controller ⇄ TLS, HTTP/2 ⇄ agent ⇄ executor  6 sockets
 //! ```
 //!
 //! Both sides of the floor read a message whole before they go on, as a message is. The echo of the floor is a thread of
@@ -58,12 +59,14 @@ struct Ours {
 }
 
 impl Ours {
-    async fn start(cluster: &Cluster) -> Ours {
-        let connected = Framework::builder("messages").connect(Some(&cluster.kubeconfig())).await;
+    async fn start(cluster: &Cluster, node: &str) -> Ours {
+        let connected = Framework::builder(node).connect(Some(&cluster.kubeconfig())).await;
         let (handle, mut events) = connected.expect("the kubeconfig is good");
         let offer = loop {
-            if let Event::Offers(offers) = events.next().await.expect("it runs") {
-                break offers.into_iter().next().expect("an offer");
+            if let Event::Offers(offers) = events.next().await.expect("it runs")
+                && let Some(offer) = offers.into_iter().find(|offer| offer.node == node)
+            {
+                break offer;
             }
         };
         // Without a limit of cpu: the kernel's throttling is not what is measured.
@@ -73,6 +76,20 @@ impl Ours {
         let mut ours = Ours { handle, events, executor: launched[0].task.clone() };
         assert_eq!(ours.answer().await, "ready");
         ours
+    }
+
+    /// Goes on until messages do not pass the controller any more.
+    async fn go_directly(&mut self, cluster: &Cluster) {
+        let passed = async || cluster.counter("muster_framework_messages_total").await;
+        let mut before = 0;
+        for _ in 0..100 {
+            self.round(&Bytes::from_static(b"on the way")).await;
+            let now = passed().await;
+            if now == std::mem::replace(&mut before, now) {
+                return;
+            }
+        }
+        panic!("messages still pass the controller");
     }
 
     async fn answer(&mut self) -> Bytes {
@@ -98,24 +115,35 @@ impl Ours {
 
 pub(crate) async fn round_trip() {
     let mut cluster = Cluster::start().await;
-    cluster.join(AgentOptions::cloud("cloud")).await;
-    let mut ours = Ours::start(&cluster).await;
+    cluster.join(AgentOptions::cloud("direct")).await;
+    cluster.join(AgentOptions::cloud("relayed").flag("--messages", "none")).await;
+    let mut direct = Ours::start(&cluster, "direct").await;
+    direct.go_directly(&cluster).await;
+    let mut relayed = Ours::start(&cluster, "relayed").await;
     for (size, pairs) in SIZES {
         let message = Bytes::from(vec![7; size]);
         let (mut raw, mut answer) = (Raw::new(size), vec![0; size]);
-        let (mut floor, mut through) = (Samples::default(), Samples::default());
+        let [mut floor, mut directly, mut through] = [(); 3].map(|()| Samples::default());
         for pair in 0..WARM_UP + pairs {
-            let (one, other) = (raw.round(&message, &mut answer), ours.round(&message).await);
+            let one = raw.round(&message, &mut answer);
+            let other = direct.round(&message).await;
+            let last = relayed.round(&message).await;
             if pair >= WARM_UP {
                 floor.push(one);
-                through.push(other);
+                directly.push(other);
+                through.push(last);
             }
         }
         floor.line(&format!("floor: TCP echo, {size} B"));
-        through.line(&format!("framework - executor - framework, {size} B"));
-        let ratio = through.median().as_secs_f64() / floor.median().as_secs_f64();
+        directly.line(&format!("framework - agent - executor, {size} B"));
+        through.line(&format!("the same through the controller, {size} B"));
+        let ratio =
+            |samples: &Samples| samples.median().as_secs_f64() / floor.median().as_secs_f64();
         let aim = if size == 1 << 20 { "<= 5x" } else { "none: hops, not bytes" };
-        figure(&format!("p50 ratio at {size} B"), ratio, "x", aim);
+        figure(&format!("p50 ratio at {size} B"), ratio(&directly), "x", aim);
+        figure(&format!("through the controller at {size} B"), ratio(&through), "x", "report");
     }
-    ours.handle.stop(false).await.expect("it is torn down");
+    for ours in [direct, relayed] {
+        ours.handle.stop(false).await.expect("it is torn down");
+    }
 }

@@ -164,6 +164,7 @@ impl Session {
             outlet,
         })
         .await?;
+        self.frameworks.may_dial(&self.guest.uid, self.number, self.guest.direct);
         self.tell_what_is_open();
         let mut beat = interval(HEARTBEAT_EVERY);
         beat.set_missed_tick_behavior(MissedTickBehavior::Delay);
@@ -443,6 +444,7 @@ impl Session {
     async fn leave(self, session_id: &str) {
         let Session { frameworks, guest, number, .. } = self;
         // The desk ends only with the controller.
+        frameworks.may_not_dial(&guest.uid, number);
         let leave = Request::Leave { uid: Arc::clone(&guest.uid), session: number };
         let _ = frameworks.scheduler.desk(leave).await;
         if frameworks.disconnect(&guest.uid, session_id, number)
