@@ -14,8 +14,7 @@ use std::net::{TcpListener, TcpStream};
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
-use muster_sdk::{Event, EventStream, Framework, FrameworkHandle, Launch};
-use muster_tests::{AgentOptions, Cluster};
+use muster_tests::{AgentOptions, Cluster, Echo};
 
 use crate::stats::{Samples, figure};
 
@@ -51,75 +50,13 @@ impl Raw {
     }
 }
 
-/// A framework and its executor.
-struct Ours {
-    handle: FrameworkHandle,
-    events: EventStream,
-    executor: String,
-}
-
-impl Ours {
-    async fn start(cluster: &Cluster, node: &str) -> Ours {
-        let connected = Framework::builder(node).connect(Some(&cluster.kubeconfig())).await;
-        let (handle, mut events) = connected.expect("the kubeconfig is good");
-        let offer = loop {
-            if let Event::Offers(offers) = events.next().await.expect("it runs")
-                && let Some(offer) = offers.into_iter().find(|offer| offer.node == node)
-            {
-                break offer;
-            }
-        };
-        // Without a limit of cpu: the kernel's throttling is not what is measured.
-        let echo = Launch::process([env!("CARGO_BIN_EXE_echo-executor")]).memory("256Mi");
-        let launched = handle.launch_tasks([echo.on(&offer)]).await.expect("launched");
-        handle.suppress_offers().await.expect("taken");
-        let mut ours = Ours { handle, events, executor: launched[0].task.clone() };
-        assert_eq!(ours.answer().await, "ready");
-        ours
-    }
-
-    /// Goes on until messages do not pass the controller any more.
-    async fn go_directly(&mut self, cluster: &Cluster) {
-        let passed = async || cluster.counter("muster_framework_messages_total").await;
-        let mut before = 0;
-        for _ in 0..100 {
-            self.round(&Bytes::from_static(b"on the way")).await;
-            let now = passed().await;
-            if now == std::mem::replace(&mut before, now) {
-                return;
-            }
-        }
-        panic!("messages still pass the controller");
-    }
-
-    async fn answer(&mut self) -> Bytes {
-        loop {
-            match self.events.next().await.expect("it runs") {
-                Event::Message(message) => return message.data,
-                Event::Update(update) => self.handle.acknowledge_status_update(&update).await,
-                _ => {}
-            }
-        }
-    }
-
-    async fn round(&mut self, message: &Bytes) -> Duration {
-        let begin = Instant::now();
-        let sent = self.handle.send_framework_message(&self.executor, message.clone()).await;
-        sent.expect("its node is there");
-        let answer = self.answer().await;
-        let elapsed = begin.elapsed();
-        assert!(answer == *message, "{} bytes came back", answer.len());
-        elapsed
-    }
-}
-
 pub(crate) async fn round_trip() {
     let mut cluster = Cluster::start().await;
     cluster.join(AgentOptions::cloud("direct")).await;
     cluster.join(AgentOptions::cloud("relayed").flag("--messages", "none")).await;
-    let mut direct = Ours::start(&cluster, "direct").await;
+    let mut direct = Echo::start(&cluster, "direct").await;
     direct.go_directly(&cluster).await;
-    let mut relayed = Ours::start(&cluster, "relayed").await;
+    let mut relayed = Echo::start(&cluster, "relayed").await;
     for (size, pairs) in SIZES {
         let message = Bytes::from(vec![7; size]);
         let (mut raw, mut answer) = (Raw::new(size), vec![0; size]);
@@ -143,7 +80,7 @@ pub(crate) async fn round_trip() {
         figure(&format!("p50 ratio at {size} B"), ratio(&directly), "x", aim);
         figure(&format!("through the controller at {size} B"), ratio(&through), "x", "report");
     }
-    for ours in [direct, relayed] {
-        ours.handle.stop(false).await.expect("it is torn down");
+    for echo in [direct, relayed] {
+        echo.handle.stop(false).await.expect("it is torn down");
     }
 }

@@ -9,6 +9,7 @@ mod fence;
 mod figure4;
 mod frameworks;
 mod lease;
+mod messages;
 mod missions;
 mod poses;
 mod preemption;
