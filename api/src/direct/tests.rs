@@ -234,7 +234,7 @@ fn in_order(delivered: &[u32]) -> bool {
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig::with_cases(2_000))]
+    #![proptest_config(ProptestConfig::with_cases(1_000))]
 
     #[test]
     fn whatever_breaks_messages_come_in_order_and_at_most_once(

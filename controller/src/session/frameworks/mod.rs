@@ -96,6 +96,8 @@ impl Mailbox {
 #[derive(Debug, Clone)]
 struct Open {
     outlet: Outlet,
+    /// It can dial agents.
+    direct: bool,
     mailbox: Arc<Mailbox>,
     /// For calls that come over HTTP.
     calls: mpsc::Sender<wire::Call>,
@@ -231,6 +233,9 @@ impl Frameworks {
         let AgentMessage { executor, data, mark } = message;
         if mark == 0 {
             direct::count("from_executor");
+        } else if !lock(&self.open).get(&*owner).is_some_and(|open| open.direct) {
+            // It was meant for a session before this one, which could dial.
+            return;
         }
         let message = wire::Message { executor, node: node.to_string(), data, mark };
         self.say(&owner, wire::event::Event::Message(message));

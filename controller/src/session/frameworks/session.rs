@@ -112,7 +112,8 @@ async fn serve(frameworks: Arc<Frameworks>, wire: Wire, guest: Guest) {
     let (uid, key) = (Arc::clone(&session.guest.uid), session.guest.key.clone());
     tracing::info!(framework = %key, id = %uid, returned = session.guest.returned, "framework subscribed");
     let calls = wire.keep_calls.unwrap_or_else(|| mpsc::channel(1).0);
-    let open = Open { outlet: outlet.clone(), mailbox, calls, cut: cut.clone() };
+    let direct = session.guest.direct;
+    let open = Open { outlet: outlet.clone(), direct, mailbox, calls, cut: cut.clone() };
     frameworks.connect(&uid, &session_id, open);
     let ended = {
         let worked = pin!(session.work(&session_id, outlet, wire.calls, &mut told));
