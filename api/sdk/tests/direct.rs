@@ -43,7 +43,8 @@ impl World {
         World { controller, session, handle, events, agent, tls }
     }
 
-    async fn tell(&self, secret: u8) {
+    /// The framework knows it when this returns.
+    async fn tell(&mut self, secret: u8) {
         let direct = proto::Direct {
             executor: "e".to_owned(),
             node: "tb1".to_owned(),
@@ -52,6 +53,8 @@ impl World {
             ticket: vec![secret; 32].into(),
         };
         self.session.say(Tell::Direct(direct)).await;
+        self.session.say(Tell::NodeLost(proto::NodeLost::default())).await;
+        assert!(matches!(soon(self.events.next()).await, Some(Event::NodeLost(_))));
     }
 
     /// A message of the executor, through the controller; the framework has taken it when this returns.

@@ -82,6 +82,7 @@ impl Session {
     }
 
     /// Waits until the framework has left.
+    #[allow(dead_code, clippy::allow_attributes, reason = "each test binary uses its own part")]
     pub(crate) async fn left(&mut self) {
         while let Ok(Some(_)) = soon(self.calls.message()).await {}
     }
