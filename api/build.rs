@@ -20,11 +20,15 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let poses = protox::compile([package("pose")], [root])?;
     let gate = protox::compile([package("gate")], [root])?;
     let plain = || tonic_prost_build::configure().build_client(false).build_server(false);
-    // Values of Secrets: `wire::secret` says how they are shown.
+    // Values of Secrets, and tickets: `wire::secret` says how they are shown.
     plain()
         .bytes(".muster.agent.v1.Message.data")
         .bytes(".muster.agent.v1.File.data")
-        .skip_debug([".muster.agent.v1.Variable", ".muster.agent.v1.File"])
+        .skip_debug([
+            ".muster.agent.v1.Variable",
+            ".muster.agent.v1.File",
+            ".muster.agent.v1.Ticket",
+        ])
         .compile_fds(agent)?;
     plain().compile_fds(poses)?;
     // Tokens of tasks: `wire::secret` says how they are shown.
@@ -34,6 +38,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         .compile_fds(gate)?;
     plain()
         .bytes(".")
+        .skip_debug([".muster.framework.v1.Direct"])
         .compile_well_known_types(true)
         .extern_path(".google.protobuf", "::pbjson_types")
         .compile_fds(sessions.clone())?;

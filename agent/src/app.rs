@@ -27,6 +27,7 @@ use crate::contact::Contact;
 use crate::driver::{Shared, chain};
 use crate::durable::FileError;
 use crate::executor::desk::Desks;
+use crate::executor::direct::Door;
 use crate::executor::work::WorkRuntime;
 use crate::footprint;
 use crate::gate;
@@ -280,6 +281,13 @@ pub async fn serve(
     supervisor.restore(records);
 
     let (commands, mut received) = mpsc::channel(16);
+    let serving = credentials.serving(&shared.node)?;
+    if serving.is_none() {
+        tracing::info!(
+            "this node's certificate is an older one: its messages pass the controller; a new token brings a new one"
+        );
+    }
+    let door = Door::new(config.messages.clone(), serving, Arc::clone(&shared.desks));
     let link = Link {
         address,
         tls: Arc::new(credentials.tls()?),
@@ -290,7 +298,7 @@ pub async fn serve(
     let engine = tokio::spawn(async move { docker.run().await });
     // It knows by now which tasks may live: what it says first does not take the robot from any of them.
     let gate = keeper.clone().map(|keeper| AbortOnDropHandle::new(tokio::spawn(keeper.run())));
-    let session = tokio::spawn(link.run(node));
+    let session = tokio::spawn(link.run(node, door));
     let mut settled = false;
     loop {
         // Cancel-safe: receivers, a join and a token.

@@ -15,6 +15,7 @@ use serde::Deserialize;
 
 use crate::declared::Declared;
 use crate::durable::{self, FileError, Keep};
+use crate::executor::direct::Where;
 use crate::gate::settings::Settings as GateSettings;
 use crate::gauge::battery::BatterySource;
 use crate::position::PositionSource;
@@ -105,6 +106,10 @@ pub struct Args {
     /// The Docker Engine's socket, or none [default: /var/run/docker.sock]
     #[arg(long, value_name = "PATH")]
     pub docker_socket: Option<String>,
+    /// Where frameworks may exchange messages with executors without the controller: `ADDR[:PORT]`, or none, once there is
+    /// an executor [default: a free port of the address by which the controller is reached]
+    #[arg(long, value_name = "ADDR[:PORT]")]
+    pub messages: Option<String>,
 }
 
 /// `agent.yaml`.
@@ -130,6 +135,7 @@ struct FileConfig {
     log_max_files: Option<u32>,
     docker_socket: Option<String>,
     gate: GateSettings,
+    messages: Option<String>,
 }
 
 /// Settings that make sense.
@@ -155,6 +161,7 @@ pub struct Config {
     pub(crate) docker_socket: Option<PathBuf>,
     /// The drivers of the actuators.
     pub(crate) gate: GateSettings,
+    pub(crate) messages: Where,
     /// To be kept for the next start.
     pub(crate) declared: Declared,
     /// The flags that nobody gave now, and that count as they were given last.
@@ -268,6 +275,7 @@ impl Args {
                 None => Some(PathBuf::from(DOCKER_SOCKET)),
             },
             gate: file.gate,
+            messages: parsed("--messages", &self.messages.or(file.messages))?.unwrap_or_default(),
             declared,
             remembered,
         })
@@ -430,6 +438,7 @@ mod tests {
             (Args { labels: vec!["x".into()], ..args() }, "--label"),
             (Args { speed: Some(-1.0), ..args() }, "--speed"),
             (Args { battery: Some("full".into()), ..args() }, "--battery"),
+            (Args { messages: Some("here".into()), ..args() }, "--messages"),
             (Args { kind: Some(Kind::Cloud), ar_res: Some("b:D".into()), ..args() }, "--kind"),
         ];
         for (args, flag) in bad {

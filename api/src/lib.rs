@@ -12,11 +12,13 @@
 //! | [`quantity`], [`duration`], [`portion`] | cpu, bytes, time spans, numbers or percentages, with their units |
 //! | [`resource`] | CR, SR and AR: what nodes have and tasks ask for |
 //! | [`pose`] | where a robot is, in which map |
+//! | [`direct`] | messages that do not pass the controller: frames, tickets, which way each goes |
 //! | [`phase`], [`condition`] | states as enums |
 //! | [`wire`] | generated protobuf messages and their conversions; wire types stop there |
 #![deny(missing_docs)]
 
 pub mod condition;
+pub mod direct;
 pub mod duration;
 pub mod id;
 pub mod kind;

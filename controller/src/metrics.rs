@@ -40,6 +40,10 @@ fn describe() {
         "Time to answer a REST request, watches and logs left out"
     );
     metrics::describe_gauge!("muster_connections", "Open TLS connections");
+    metrics::describe_counter!(
+        "muster_framework_messages_total",
+        "Messages between frameworks and executors that passed the controller, by direction"
+    );
 }
 
 /// Keeps the recorder's memory flat until `stop`.

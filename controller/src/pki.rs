@@ -17,6 +17,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use jiff::{Span, Timestamp, tz::TimeZone};
+use muster_api::direct::server_name;
 use rcgen::{
     BasicConstraints, CertificateParams, CertificateSigningRequestParams, DistinguishedName,
     DnType, ExtendedKeyUsagePurpose, IsCa, Issuer, KeyPair, KeyUsagePurpose,
@@ -157,7 +158,7 @@ impl Pki {
     /// [`PkiError::Make`] when the request cannot be read or its signature is wrong.
     pub fn sign_node(&self, name: &str, csr: &str, now: Timestamp) -> Result<String, PkiError> {
         let public_key = CertificateSigningRequestParams::from_pem(csr)?.public_key;
-        let params = client_params(&format!("{NODE_PREFIX}{name}"), NODES, now)?;
+        let params = node_params(name, now)?;
         let signed =
             CertificateSigningRequestParams { params, public_key }.signed_by(&self.issuer)?;
         Ok(signed.pem())
@@ -203,6 +204,15 @@ fn client_params(cn: &str, o: &str, now: Timestamp) -> Result<CertificateParams,
     params.key_usages = vec![KeyUsagePurpose::DigitalSignature];
     params.extended_key_usages = vec![ExtendedKeyUsagePurpose::ClientAuth];
     params.use_authority_key_identifier_extension = true;
+    Ok(params)
+}
+
+/// An agent is a client of the controller, and a server for frameworks that exchange messages with its executors.
+fn node_params(name: &str, now: Timestamp) -> Result<CertificateParams, PkiError> {
+    let mut params = client_params(&format!("{NODE_PREFIX}{name}"), NODES, now)?;
+    let server = CertificateParams::new(vec![server_name(name)])?;
+    params.subject_alt_names = server.subject_alt_names;
+    params.extended_key_usages.push(ExtendedKeyUsagePurpose::ServerAuth);
     Ok(params)
 }
 
@@ -378,7 +388,10 @@ mod tests {
         let der = CertificateDer::from_pem_slice(pem.as_bytes()).unwrap();
         let (_, certificate) = x509_parser::parse_x509_certificate(&der).unwrap();
         assert_eq!(certificate.subject().to_string(), "O=muster:nodes, CN=muster:node:turtlebot-1");
-        assert!(certificate.subject_alternative_name().unwrap().is_none());
+        let (names, _) = inspect(&pem).unwrap();
+        assert_eq!(names, BTreeSet::from(["turtlebot-1.nodes.muster.dev".to_owned()]));
+        let usage = certificate.extended_key_usage().unwrap().unwrap().value;
+        assert!(usage.client_auth && usage.server_auth);
         assert!(!certificate.is_ca());
         assert!(pki.sign_node("x", "not a request", now()).is_err());
     }

@@ -12,6 +12,8 @@ use muster_api::kind::lease::Lease;
 use muster_api::kind::node::Node;
 use muster_api::kind::task::{Task, TaskStatus};
 use muster_api::phase::TaskPhase;
+use rustls::pki_types::pem::PemObject as _;
+use rustls::pki_types::{CertificateDer, PrivateKeyDer};
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
@@ -243,6 +245,39 @@ impl Cluster {
     pub async fn get(&self, path: &str) -> Value {
         let request = Request::get(path).body(Vec::new()).expect("a request");
         self.client().await.request(request).await.expect("the controller answers")
+    }
+
+    /// A counter of the controller, of all its labels together; 0: it has not counted yet.
+    pub async fn counter(&self, name: &str) -> u64 {
+        let request = Request::get("/metrics").body(Vec::new()).expect("a request");
+        let text = self.client().await.request_text(request).await.expect("metrics");
+        let own = text.lines().filter(|line| {
+            line.strip_prefix(name).is_some_and(|rest| rest.starts_with(['{', ' ']))
+        });
+        let values = own.filter_map(|line| line.rsplit(' ').next()?.parse::<u64>().ok());
+        values.sum()
+    }
+
+    /// Messages between frameworks and executors that have passed the controller.
+    pub async fn messages(&self) -> u64 {
+        self.counter("muster_framework_messages_total").await
+    }
+
+    /// TLS with the admin's certificate, for a protocol that is not HTTP.
+    pub fn admin_tls(&self, protocol: &[u8]) -> rustls::ClientConfig {
+        let pki = self.dir.path().join("controller").join("pki");
+        let read = |name: &str| fs::read(pki.join(name)).expect("the controller's own files");
+        let (ca, certificate, key) = (read("ca.crt"), read("admin.crt"), read("admin.key"));
+        let mut roots = rustls::RootCertStore::empty();
+        roots.add(CertificateDer::from_pem_slice(&ca).expect("a CA")).expect("a CA");
+        let certificate = CertificateDer::from_pem_slice(&certificate).expect("a certificate");
+        let key = PrivateKeyDer::from_pem_slice(&key).expect("a key");
+        let mut config = rustls::ClientConfig::builder()
+            .with_root_certificates(roots)
+            .with_client_auth_cert(vec![certificate], key)
+            .expect("a pair");
+        config.alpn_protocols = vec![protocol.to_vec()];
+        config
     }
 
     /// The log of a task of the default namespace.

@@ -6,6 +6,7 @@
 //! | [`cluster`] | starting, killing and restarting the daemons; the API of the cluster |
 //! | [`wait`] | waiting for what a watch or the kernel shows, with a generous deadline |
 //! | [`puppet`] | frameworks on the Python SDK, one process each |
+//! | [`echo`] | a framework on the Rust SDK, with an executor that sends messages back |
 //! | [`docker`] | an image without a registry |
 //! | [`kernel`] | what the kernel says: processes, start times, cgroups |
 //!
@@ -13,9 +14,11 @@
 
 pub mod cluster;
 pub mod docker;
+pub mod echo;
 pub mod kernel;
 pub mod puppet;
 pub mod wait;
 
 pub use cluster::{AgentOptions, Cluster};
+pub use echo::Echo;
 pub use puppet::Puppet;

@@ -12,13 +12,12 @@ use muster_agent_core::executor::{Effect, Event, Executor, Life, Record, Update,
 use muster_agent_core::observed::{End, Said};
 use muster_agent_core::workload::{State, Workload};
 use muster_api::id::TaskUid;
-use muster_api::wire::agent::v1::Message;
 use muster_api::wire::executor::v1 as proto;
 use proto::event::Event as Say;
 use serde::{Deserialize, Serialize};
 use tokio::sync::watch;
 
-use super::frame::MESSAGE_MAX;
+use super::post::Posts;
 use super::queue::Queue;
 use super::room::Room;
 use crate::checkpoint::{self, Checkpoint, Framework};
@@ -93,9 +92,9 @@ pub(crate) struct Desks {
     desks: Mutex<BTreeMap<TaskUid, Desk>>,
     changed: watch::Sender<()>,
     /// Those that are executors, as far as is known.
-    executors: watch::Sender<BTreeSet<TaskUid>>,
-    /// Messages to frameworks.
-    messages: Queue<Message>,
+    pub(super) executors: watch::Sender<BTreeSet<TaskUid>>,
+    /// Messages between executors and frameworks.
+    pub(super) posts: Posts,
     checkpoint: Checkpoint,
     node: String,
 }
@@ -103,8 +102,8 @@ pub(crate) struct Desks {
 impl Desks {
     pub(crate) fn new(checkpoint: Checkpoint, node: String) -> Desks {
         let (desks, changed) = (Mutex::default(), watch::Sender::default());
-        let (executors, messages) = (watch::Sender::default(), Queue::default());
-        Desks { desks, changed, executors, messages, checkpoint, node }
+        let (executors, posts) = (watch::Sender::default(), Posts::default());
+        Desks { desks, changed, executors, posts, checkpoint, node }
     }
 
     fn desks(&self) -> MutexGuard<'_, BTreeMap<TaskUid, Desk>> {
@@ -205,10 +204,12 @@ impl Desks {
     }
 
     fn count_executors(&self) {
+        let mut posts = self.posts.table();
         let desks = self.desks();
         let there = desks.iter().filter(|(_, desk)| desk.machine.is_there());
         let there: BTreeSet<TaskUid> = there.map(|(uid, _)| uid.clone()).collect();
-        // Under the lock: an older count never replaces a newer one.
+        // Under the locks: an older count never replaces a newer one.
+        self.posts.keep_only(&mut posts, &there);
         self.executors.send_if_modified(|executors| {
             let changed = *executors != there;
             *executors = there;
@@ -402,30 +403,16 @@ impl Desks {
         }
     }
 
-    /// A message of an executor for its framework.
-    pub(super) fn say(&self, uid: &TaskUid, data: Bytes) {
+    /// A message of a framework for its executor; at most once. False: the executor is not there, or does not keep up.
+    pub(super) fn hand_over(&self, executor: &TaskUid, data: Bytes) -> bool {
         let size = data.len();
-        let message = Message { executor: uid.to_string(), data };
-        if size > MESSAGE_MAX || !self.messages.push(message, size.max(1)) {
-            tracing::warn!(%uid, size, "an executor's message is dropped");
-        }
-    }
-
-    /// The next message for a framework. Cancel-safe.
-    pub(crate) async fn said(&self) -> Message {
-        self.messages.pop().await
-    }
-
-    /// A message of a framework for its executor; at most once.
-    pub(crate) fn deliver(&self, message: Message) {
-        let Message { executor, data } = message;
-        let size = data.len();
-        let desks = self.desks();
-        let out = desks.get(&TaskUid::new(executor.as_str())).and_then(|desk| desk.out.as_ref());
+        let out = self.desks().get(executor).and_then(|desk| desk.out.clone());
         let say = Say::Message(proto::Message { data });
-        if !out.is_some_and(|out| out.push(event(say), size.max(1))) {
-            tracing::warn!(executor, size, "a framework's message is dropped: nobody reads it");
+        let taken = out.is_some_and(|out| out.push(event(say), size.max(1)));
+        if !taken {
+            tracing::warn!(%executor, size, "a framework's message is dropped: nobody reads it");
         }
+        taken
     }
 }
 

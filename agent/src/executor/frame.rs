@@ -8,7 +8,7 @@ use prost::Message;
 use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt};
 
 /// Longest message of a framework or an executor, bytes.
-pub(crate) const MESSAGE_MAX: usize = 4 << 20;
+pub(crate) const MESSAGE_MAX: usize = muster_api::direct::MESSAGE_MAX;
 
 /// Longest frame: the longest message, and what is around it. Also the link's.
 pub(crate) const FRAME_MAX: usize = MESSAGE_MAX + (64 << 10);

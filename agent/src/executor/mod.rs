@@ -4,7 +4,7 @@
 //! ```text
 //! executor ⇄ seat (its task's driver owns it) ⇄ desks ⇄ work runtime ⇄ driver of the work
 //!                                                 ⇅
-//!                                     link (messages of the framework)
+//!                      messages of the framework: post ⇄ link, or directly: direct
 //! ```
 //!
 //! | module | holds |
@@ -12,12 +12,16 @@
 //! | [`frame`] | messages on the socket |
 //! | [`queue`] | what waits for a slow reader, bounded |
 //! | [`seat`] | one task's socket and the connection on it |
+//! | [`post`] | messages of frameworks: which way each goes, and who may come |
+//! | [`direct`] | connections of frameworks: the listener and what goes over each |
 //! | [`desk`] | all executors of the node and their works; carries out what the core decides |
 //! | [`room`] | an executor's limits: its own resources and those of its live works |
 //! | [`work`] | works as tasks: the runtime that their drivers ask |
 
 pub(crate) mod desk;
+pub(crate) mod direct;
 pub(crate) mod frame;
+mod post;
 pub(crate) mod queue;
 mod room;
 pub(crate) mod seat;

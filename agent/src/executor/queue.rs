@@ -6,7 +6,7 @@ use std::sync::{Mutex, PoisonError};
 use tokio::sync::Notify;
 
 /// Bytes of messages that wait; four of the longest. A reader that is further behind loses some.
-const MOST_BYTES: usize = 4 * super::frame::MESSAGE_MAX;
+pub(super) const MOST_BYTES: usize = 4 * super::frame::MESSAGE_MAX;
 
 /// The queue.
 #[derive(Debug)]

@@ -10,7 +10,7 @@ use http::{Request, StatusCode, header};
 use hyper::body::Body;
 use hyper_util::rt::TokioIo;
 use rcgen::{CertificateParams, DnType, KeyPair};
-use rustls::ClientConfig;
+use rustls::{ClientConfig, ServerConfig};
 use serde::{Deserialize, Serialize};
 
 use super::Address;
@@ -103,11 +103,22 @@ impl Credentials {
 
     /// The session's TLS.
     pub(crate) fn tls(&self) -> Result<ClientConfig, JoinError> {
+        let [ca, certificate, key] = self.read()?;
+        Ok(tls::mutual(&ca, &certificate, &key)?)
+    }
+
+    /// TLS for frameworks that come directly; none: the certificate is older than that.
+    pub(crate) fn serving(&self, node: &str) -> Result<Option<ServerConfig>, JoinError> {
+        let [ca, certificate, key] = self.read()?;
+        Ok(tls::serving(&ca, &certificate, &key, node)?)
+    }
+
+    fn read(&self) -> Result<[Vec<u8>; 3], FileError> {
         let read = |name: &str| {
             let path = self.dir.join(name);
             std::fs::read(&path).map_err(FileError::at("read", &path))
         };
-        Ok(tls::mutual(&read("ca.crt")?, &read("node.crt")?, &read("node.key")?)?)
+        Ok([read("ca.crt")?, read("node.crt")?, read("node.key")?])
     }
 
     fn write(&self, key: &str, answer: &JoinAnswer, token: &Token) -> Result<(), FileError> {

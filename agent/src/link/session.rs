@@ -10,7 +10,8 @@
 //! sent again until it is acknowledged. Losing a session loses nothing but time.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::sync::Arc;
+use std::net::{IpAddr, SocketAddr};
+use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
 use hyper_util::rt::TokioIo;
@@ -31,6 +32,7 @@ use super::stream_logs::stream_logs;
 use super::{Address, report, tls};
 use crate::clock;
 use crate::driver::{Shared, chain};
+use crate::executor::direct::Door;
 use crate::executor::frame::FRAME_MAX;
 use crate::gate::keeper::Standing;
 use crate::node::Node;
@@ -105,11 +107,11 @@ pub(crate) fn outgoing(body: Say) -> proto::AgentMessage {
 
 impl Link {
     /// Keeps a session until it is dropped.
-    pub(crate) async fn run(self, mut node: Node) {
+    pub(crate) async fn run(self, mut node: Node, mut door: Door) {
         let mut pause = PAUSE.0;
         loop {
             let begun = Instant::now();
-            if let Err(error) = self.session(&mut node).await {
+            if let Err(error) = self.session(&mut node, &mut door).await {
                 // One line a loss, not one a try.
                 if begun.elapsed() > DEAF_AFTER || pause == PAUSE.0 {
                     tracing::warn!(error = chain(&error), "not connected to the controller");
@@ -123,7 +125,8 @@ impl Link {
         }
     }
 
-    async fn channel(&self) -> Result<Channel, SessionError> {
+    /// Also the address by which the controller is reached.
+    async fn channel(&self) -> Result<(Channel, Option<IpAddr>), SessionError> {
         let endpoint = Endpoint::from_shared(format!("http://{}", self.address))
             .map_err(SessionError::Connect)?
             .connect_timeout(DEAF_AFTER)
@@ -134,15 +137,25 @@ impl Link {
             .keep_alive_timeout(DEAF_AFTER / 2)
             .keep_alive_while_idle(true);
         let (address, tls) = (self.address.clone(), Arc::clone(&self.tls));
+        let own = Arc::new(OnceLock::new());
+        let found = Arc::clone(&own);
         let connector = tower::service_fn(move |_: http::Uri| {
-            let (address, tls) = (address.clone(), Arc::clone(&tls));
-            async move { tls::connect(&address, tls).await.map(TokioIo::new) }
+            let (address, tls, found) = (address.clone(), Arc::clone(&tls), Arc::clone(&found));
+            async move {
+                let stream = tls::connect(&address, tls).await?;
+                // Another one than that of the first connection would be no worse.
+                let _ = found.set(stream.get_ref().0.get_ref().local_addr().ok());
+                Ok::<_, tls::ConnectError>(TokioIo::new(stream))
+            }
         });
-        endpoint.connect_with_connector(connector).await.map_err(SessionError::Connect)
+        let channel = endpoint.connect_with_connector(connector).await;
+        let own = own.get().copied().flatten();
+        Ok((channel.map_err(SessionError::Connect)?, own.map(|own: SocketAddr| own.ip())))
     }
 
-    async fn session(&self, node: &mut Node) -> Result<(), SessionError> {
-        let mut client = AgentServiceClient::new(self.channel().await?)
+    async fn session(&self, node: &mut Node, door: &mut Door) -> Result<(), SessionError> {
+        let (channel, own) = self.channel().await?;
+        let mut client = AgentServiceClient::new(channel)
             .max_decoding_message_size(FRAME_MAX)
             .max_encoding_message_size(FRAME_MAX);
         let (out, queue) = mpsc::channel(QUEUE);
@@ -175,6 +188,7 @@ impl Link {
         let mut session = Session {
             link: self,
             node,
+            door: (door, own),
             out,
             said: said.collect(),
             beats: BTreeMap::new(),
@@ -203,6 +217,8 @@ async fn changed(standing: &mut Option<watch::Receiver<Standing>>) {
 struct Session<'a> {
     link: &'a Link,
     node: &'a mut Node,
+    /// Where frameworks may come, and the address by which the controller is reached.
+    door: (&'a mut Door, Option<IpAddr>),
     out: mpsc::Sender<proto::AgentMessage>,
     /// By task: the newest sequence said in this session, and when.
     said: BTreeMap<String, (u64, Instant)>,
@@ -286,7 +302,6 @@ impl Session<'_> {
                 self.link.shared.board.acknowledged(&answer.uid, answer.sequence);
             }
             Hear::Log(request) => self.start_reader(request).await,
-            Hear::Message(message) => self.link.shared.desks.deliver(message),
             Hear::Order(order) => match &self.link.shared.gate {
                 Some(gate) => gate.demand(order.estop_tier, order.estop_release),
                 None if order.estop_tier > 0 => {
@@ -294,6 +309,8 @@ impl Session<'_> {
                 }
                 None => {}
             },
+            Hear::Message(message) => self.link.shared.desks.hear(message),
+            Hear::Tickets(tickets) => self.link.shared.desks.admit(tickets),
             Hear::LogCancel(cancel) => {
                 if let Some(reader) = self.requests.remove(&cancel.id) {
                     reader.abort();
@@ -334,11 +351,16 @@ impl Session<'_> {
     }
 
     async fn say_executors(
-        &self,
+        &mut self,
         executors: &mut watch::Receiver<BTreeSet<TaskUid>>,
     ) -> Result<(), SessionError> {
-        let tasks = executors.borrow_and_update().iter().map(ToString::to_string).collect();
-        self.say(Say::Executors(proto::Executors { tasks })).await
+        let tasks: Vec<String> =
+            executors.borrow_and_update().iter().map(ToString::to_string).collect();
+        let (door, own) = &mut self.door;
+        // Who has no executors needs no door.
+        let address = if tasks.is_empty() { None } else { door.address(*own).await };
+        let address = address.unwrap_or_default();
+        self.say(Say::Executors(proto::Executors { tasks, address })).await
     }
 
     async fn say_heartbeat(&mut self) -> Result<(), SessionError> {

@@ -2,14 +2,17 @@
 
 use std::sync::Arc;
 
+use muster_api::direct::{ALPN, server_name};
 use muster_api::wire::READ_BUFFER;
-use rustls::client::WebPkiServerVerifier;
 use rustls::client::danger::{HandshakeSignatureValid, ServerCertVerified, ServerCertVerifier};
+use rustls::client::{WebPkiServerVerifier, verify_server_name};
 use rustls::crypto::{CryptoProvider, ring};
 use rustls::pki_types::pem::PemObject;
 use rustls::pki_types::{CertificateDer, PrivateKeyDer, ServerName, UnixTime};
+use rustls::server::{ParsedCertificate, WebPkiClientVerifier};
 use rustls::{
-    CertificateError, ClientConfig, DigitallySignedStruct, Error, RootCertStore, SignatureScheme,
+    CertificateError, ClientConfig, DigitallySignedStruct, Error, RootCertStore, ServerConfig,
+    SignatureScheme,
 };
 use tokio::io::BufReader;
 use tokio::net::TcpStream;
@@ -63,21 +66,67 @@ pub(crate) fn by_hash(ca_hash: [u8; 32]) -> Result<ClientConfig, ConnectError> {
     Ok(config)
 }
 
+/// What a join gave, read.
+struct Own {
+    roots: RootCertStore,
+    chain: Vec<CertificateDer<'static>>,
+    key: PrivateKeyDer<'static>,
+}
+
+impl Own {
+    fn read(ca: &[u8], certificate: &[u8], key: &[u8]) -> Result<Own, ConnectError> {
+        let bad =
+            |_| ConnectError::Credentials(Error::InvalidCertificate(CertificateError::BadEncoding));
+        let mut roots = RootCertStore::empty();
+        for authority in CertificateDer::pem_slice_iter(ca) {
+            roots.add(authority.map_err(bad)?).map_err(ConnectError::Credentials)?;
+        }
+        let chain: Vec<CertificateDer<'static>> =
+            CertificateDer::pem_slice_iter(certificate).collect::<Result<_, _>>().map_err(bad)?;
+        let key = PrivateKeyDer::from_pem_slice(key).map_err(bad)?;
+        Ok(Own { roots, chain, key })
+    }
+}
+
+/// For frameworks that come directly: shows the certificate of `node`, and believes clients of the CA of the join. None: the
+/// certificate is of a join before such certificates were for servers as well.
+pub(crate) fn serving(
+    ca: &[u8],
+    certificate: &[u8],
+    key: &[u8],
+    node: &str,
+) -> Result<Option<ServerConfig>, ConnectError> {
+    let Own { roots, chain, key } = Own::read(ca, certificate, key)?;
+    let for_node = |leaf: &CertificateDer<'_>| {
+        let name = ServerName::try_from(server_name(node));
+        let leaf = ParsedCertificate::try_from(leaf);
+        name.is_ok_and(|name| leaf.is_ok_and(|leaf| verify_server_name(&leaf, &name).is_ok()))
+    };
+    if !chain.first().is_some_and(for_node) {
+        return Ok(None);
+    }
+    let verifier = WebPkiClientVerifier::builder_with_provider(Arc::new(roots), provider())
+        .build()
+        .map_err(|error| ConnectError::Credentials(Error::General(error.to_string())))?;
+    let mut config = ServerConfig::builder_with_provider(provider())
+        .with_protocol_versions(&[&rustls::version::TLS13])
+        .map_err(ConnectError::Credentials)?
+        .with_client_cert_verifier(verifier)
+        .with_single_cert(chain, key)
+        .map_err(ConnectError::Credentials)?;
+    config.alpn_protocols = vec![ALPN.to_vec()];
+    // Nobody comes so often that a handshake would be worth remembering.
+    config.send_tls13_tickets = 0;
+    Ok(Some(config))
+}
+
 /// Believes the CA of the join, and shows this node's certificate.
 pub(crate) fn mutual(
     ca: &[u8],
     certificate: &[u8],
     key: &[u8],
 ) -> Result<ClientConfig, ConnectError> {
-    let bad =
-        |_| ConnectError::Credentials(Error::InvalidCertificate(CertificateError::BadEncoding));
-    let mut roots = RootCertStore::empty();
-    for authority in CertificateDer::pem_slice_iter(ca) {
-        roots.add(authority.map_err(bad)?).map_err(ConnectError::Credentials)?;
-    }
-    let chain: Vec<CertificateDer<'static>> =
-        CertificateDer::pem_slice_iter(certificate).collect::<Result<_, _>>().map_err(bad)?;
-    let key = PrivateKeyDer::from_pem_slice(key).map_err(bad)?;
+    let Own { roots, chain, key } = Own::read(ca, certificate, key)?;
     let mut config = ClientConfig::builder_with_provider(provider())
         .with_safe_default_protocol_versions()
         .map_err(ConnectError::Credentials)?

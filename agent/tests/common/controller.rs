@@ -10,6 +10,7 @@ use bytes::Bytes;
 use futures::{Stream, StreamExt};
 use hyper_util::rt::{TokioExecutor, TokioIo};
 use hyper_util::service::TowerToHyperService;
+use muster_api::direct::server_name;
 use muster_api::wire::agent::v1 as proto;
 use proto::agent_message::Body as Heard;
 use proto::controller_message::Body as Say;
@@ -54,6 +55,10 @@ struct Seen {
     logs: BTreeMap<u64, (Vec<u8>, Option<String>)>,
     messages: Vec<proto::Message>,
     executors: Vec<Vec<String>>,
+    /// Where the agent takes messages of frameworks, as it said last.
+    door: String,
+    /// Certificates are for clients only.
+    older: bool,
     session: Option<mpsc::UnboundedSender<Result<proto::ControllerMessage, Status>>>,
     /// What every session begins with.
     assignments: BTreeMap<String, proto::Assignment>,
@@ -249,7 +254,50 @@ impl Controller {
     /// Says something to an executor, as its framework would.
     pub fn message(&self, executor: &str, data: Vec<u8>) {
         let executor = executor.to_owned();
-        self.say(Say::Message(proto::Message { executor, data: data.into() }));
+        self.say(Say::Message(proto::Message { executor, data: data.into(), mark: 0 }));
+    }
+
+    /// The mark of a line, behind what was said to the executor before.
+    pub fn mark(&self, executor: &str, mark: u64) {
+        let executor = executor.to_owned();
+        self.say(Say::Message(proto::Message { executor, mark, ..Default::default() }));
+    }
+
+    /// Says who may come to an executor directly; none: nobody.
+    pub fn ticket(&self, executor: &str, secret: Option<[u8; 32]>) {
+        let secret = secret.map(|secret| secret.to_vec()).unwrap_or_default();
+        let ticket = proto::Ticket { executor: executor.to_owned(), secret };
+        self.say(Say::Tickets(proto::Tickets { tickets: vec![ticket] }));
+    }
+
+    /// Where frameworks may come.
+    pub fn door(&self) -> Option<SocketAddr> {
+        self.seen(|seen| seen.door.parse().ok())
+    }
+
+    /// From now on certificates are for clients only, as they were once.
+    pub fn sign_as_before(&self) {
+        self.seen(|seen| seen.older = true);
+    }
+
+    /// TLS of a framework's side, with or without a certificate.
+    pub fn framework_tls(&self, known: bool) -> rustls::ClientConfig {
+        let provider = Arc::new(rustls::crypto::ring::default_provider());
+        let mut roots = rustls::RootCertStore::empty();
+        roots.add(CertificateDer::from(self.ca.der.clone())).unwrap();
+        let config = rustls::ClientConfig::builder_with_provider(provider)
+            .with_safe_default_protocol_versions()
+            .unwrap()
+            .with_root_certificates(roots);
+        let key = KeyPair::generate().unwrap();
+        let leaf = CertificateParams::default().signed_by(&key, &self.ca.issuer).unwrap();
+        let key = PrivateKeyDer::from_pem_slice(key.serialize_pem().as_bytes()).unwrap();
+        let mut config = match known {
+            true => config.with_client_auth_cert(vec![leaf.der().clone()], key).unwrap(),
+            false => config.with_no_client_auth(),
+        };
+        config.alpn_protocols = vec![muster_api::direct::ALPN.to_vec()];
+        config
     }
 
     /// What executors said to frameworks.
@@ -376,6 +424,12 @@ async fn answer_join(
         let csr = CertificateSigningRequestParams::from_pem(asked["csr"].as_str().unwrap());
         let mut csr = csr.unwrap();
         csr.params.extended_key_usages = vec![ExtendedKeyUsagePurpose::ClientAuth];
+        if !seen.lock().unwrap().older {
+            let name = server_name(asked["nodeName"].as_str().unwrap());
+            csr.params.subject_alt_names =
+                CertificateParams::new(vec![name]).unwrap().subject_alt_names;
+            csr.params.extended_key_usages.push(ExtendedKeyUsagePurpose::ServerAuth);
+        }
         let certificate = csr.signed_by(&ca.issuer).unwrap();
         seen.lock().unwrap().joins += 1;
         (201, serde_json::json!({ "certificate": certificate.pem(), "ca": ca.pem }))
@@ -478,6 +532,7 @@ fn take(seen: &mut Seen, heard: Heard) {
         }
         Heard::Executors(executors) => {
             seen.executors.push(executors.tasks);
+            seen.door = executors.address;
             None
         }
         Heard::Message(message) => {

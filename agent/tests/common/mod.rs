@@ -1,5 +1,5 @@
 //! What the agent's tests stand on: a controller that does what the test says ([`controller`]), agents as
-//! real processes ([`agent`]), the kernel's accounts ([`cpu`]), and looking until something is so ([`until`]).
+//! real processes ([`agent`]), frameworks that come directly ([`framework`]), the kernel's accounts ([`cpu`]), and looking until something is so ([`until`]).
 #![allow(dead_code, reason = "each test binary uses its own part")]
 #![allow(
     clippy::unwrap_used,
@@ -13,6 +13,7 @@ pub mod agent;
 pub mod controller;
 pub mod cpu;
 pub mod executor;
+pub mod framework;
 pub mod gate;
 
 use std::time::{Duration, Instant};

@@ -3,6 +3,7 @@
 use std::fmt;
 use std::path::PathBuf;
 
+use muster_api::direct::MESSAGE_MAX;
 use muster_api::wire::framework::v1 as proto;
 
 /// Why a call was not done.
@@ -73,6 +74,19 @@ impl CallRefused {
     pub(crate) fn disconnected() -> Self {
         let message = "the session broke before the answer came".to_owned();
         CallRefused { reason: Reason::Disconnected, message, causes: Vec::new() }
+    }
+
+    pub(crate) fn too_long(bytes: usize) -> Self {
+        let message =
+            format!("{bytes} bytes are more than the {MESSAGE_MAX} that a message may have");
+        let cause = Cause { field: "message.data".to_owned(), message: message.clone() };
+        CallRefused { reason: Reason::Invalid, message, causes: vec![cause] }
+    }
+
+    /// By the agent, of a message.
+    pub(crate) fn not_taken() -> Self {
+        let message = "the executor is away, or does not keep up with what it is sent".to_owned();
+        CallRefused { reason: Reason::Unavailable, message, causes: Vec::new() }
     }
 
     pub(crate) fn ended() -> Self {

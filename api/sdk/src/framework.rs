@@ -9,8 +9,9 @@ use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::AbortOnDropHandle;
 
+use crate::link::direct::Lanes;
 use crate::link::kubeconfig;
-use crate::link::session::{Identity, Link, Session};
+use crate::link::session::{Identity, Inbox, Link, Session};
 use crate::link::state::StateFile;
 use crate::{ConnectError, EventStream, Filter, FrameworkHandle, Position, event};
 
@@ -119,6 +120,7 @@ impl Builder {
     ) -> Result<(FrameworkHandle, EventStream), ConnectError> {
         let target = kubeconfig::load(&kubeconfig::files(kubeconfig))?;
         let tls = target.tls().map_err(ConnectError::Credentials)?;
+        let direct = target.direct_tls().map_err(ConnectError::Credentials)?;
         let position = match (self.position, self.radius) {
             (Some(position), Some(radius)) => Some(position.radius(radius)),
             (None, Some(_)) => return Err(ConnectError::RadiusWithoutPosition),
@@ -132,14 +134,18 @@ impl Builder {
             position: position.map(|position| position.0),
             filter: self.filter.map(|filter| filter.0),
             failover_timeout_seconds: self.failover.map(|timeout| timeout.as_secs_f64()),
+            direct: true,
         };
         let (to_session, commands) = mpsc::channel(CALLS);
         let (to_stream, inlet) = event::channel();
         let stop = CancellationToken::new();
         let link = Link { address: target.address, tls: Arc::new(tls) };
-        let session =
-            Session::new(link, Identity { subscribe, state }, commands, to_stream, stop.clone());
+        let (lanes, relayed) = Lanes::new(Arc::new(direct), to_stream.clone());
+        let inbox = Inbox { commands, relayed, lanes: lanes.clone() };
+        let identity = Identity { subscribe, state };
+        let session = Session::new(link, identity, inbox, to_stream, stop.clone());
         let session = AbortOnDropHandle::new(tokio::spawn(session.run()));
-        Ok((FrameworkHandle::new(to_session, stop), EventStream { inlet, _session: session }))
+        let handle = FrameworkHandle::new(to_session, lanes, stop);
+        Ok((handle, EventStream { inlet, _session: session }))
     }
 }

@@ -9,6 +9,7 @@ use proto::call::Call as Say;
 use tokio::sync::{mpsc, oneshot};
 use tokio_util::sync::CancellationToken;
 
+use crate::link::direct::Lanes;
 use crate::link::session::Command;
 use crate::{CallRefused, Filter, Launch, Position, PositionSource};
 
@@ -19,6 +20,7 @@ use crate::{CallRefused, Filter, Launch, Position, PositionSource};
 #[derive(Debug, Clone)]
 pub struct FrameworkHandle {
     commands: mpsc::Sender<Command>,
+    lanes: Lanes,
     stop: CancellationToken,
 }
 
@@ -26,8 +28,12 @@ pub struct FrameworkHandle {
 ///
 /// Every call fails with the controller's refusal, or with why there is no answer.
 impl FrameworkHandle {
-    pub(crate) fn new(commands: mpsc::Sender<Command>, stop: CancellationToken) -> Self {
-        FrameworkHandle { commands, stop }
+    pub(crate) fn new(
+        commands: mpsc::Sender<Command>,
+        lanes: Lanes,
+        stop: CancellationToken,
+    ) -> Self {
+        FrameworkHandle { commands, lanes, stop }
     }
 
     async fn call(&self, say: Say) -> Result<Vec<proto::Launched>, CallRefused> {
@@ -128,15 +134,18 @@ impl FrameworkHandle {
         self.call(Say::Reconcile(proto::Reconcile { tasks })).await.map(drop)
     }
 
-    /// To one of the framework's executors, by its task's uid: at most once, up to 4 MiB.
+    /// To one of the framework's executors, by its task's uid: at most once, in order, up to 4 MiB. The first messages pass the
+    /// controller; meanwhile a connection to the executor's agent is made, which the following ones go over, also while
+    /// the controller is away. Where that cannot be made or breaks, messages pass the controller again.
+    ///
+    /// `Ok`: the agent, or the controller on the way to it, has the message. With
+    /// [`Reason::Disconnected`](crate::Reason::Disconnected) it may have come, or not.
     pub async fn send_framework_message(
         &self,
         executor: &str,
         data: impl Into<Bytes>,
     ) -> Result<(), CallRefused> {
-        let (executor, data) = (executor.to_owned(), data.into());
-        let message = proto::Message { executor, node: String::new(), data };
-        self.call(Say::Message(message)).await.map(drop)
+        self.lanes.send(executor, data.into()).await
     }
 
     /// Ends the framework here and waits until its session is over. With `failover` its tasks go on until the failover

@@ -3,6 +3,7 @@
 //! ```text
 //!  your Scheduler ◀─ callbacks ─ SchedulerDriver ◀─ EventStream ─┐
 //!        └────────── actions ───▶ FrameworkHandle ── Command ──▶ link::session ◀──▶ controller
+//!                                        └─ messages of executors ─▶ link::direct ◀──▶ agent
 //!  your Executor  ◀─ callbacks ─ ExecutorDriver ◀── frames ─────────────────────▶ agent (Unix socket)
 //!        └────────── actions ───▶ ExecutorHandle
 //! ```

@@ -163,7 +163,8 @@ async fn messages_of_four_mebibytes_pass_both_ways() {
     let mut controller = Controller::start().await;
     let (mut session, mut notes, _driver) = driven(&mut controller).await;
     let data = bytes::Bytes::from(vec![7; 4 << 20]);
-    let message = proto::Message { executor: "e".into(), node: "tb1".into(), data: data.clone() };
+    let (executor, node) = ("e".into(), "tb1".into());
+    let message = proto::Message { executor, node, data: data.clone(), mark: 0 };
     session.say(Tell::Message(message)).await;
     let (id, Say::Message(back)) = session.call().await else { panic!("no Message") };
     assert_eq!((back.executor.as_str(), back.data == data), ("e", true));

@@ -1,8 +1,10 @@
-//! How messages with values of ConfigMaps and Secrets, and with tasks' tokens, are shown in logs: by name and size.
+//! How messages with values of ConfigMaps and Secrets are shown in logs: by name and size; and tickets and tasks' tokens: by
+//! whose they are.
 
 use std::fmt;
 
-use super::agent::v1::{File, Variable};
+use super::agent::v1::{File, Ticket, Variable};
+use super::framework::v1::Direct;
 use super::gate::v1::{Register, Seat};
 
 impl fmt::Debug for Variable {
@@ -35,6 +37,26 @@ impl fmt::Debug for Seat {
     }
 }
 
+impl fmt::Debug for Ticket {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let revoked = self.secret.is_empty();
+        f.debug_struct("Ticket")
+            .field("executor", &self.executor)
+            .field("revoked", &revoked)
+            .finish_non_exhaustive()
+    }
+}
+
+impl fmt::Debug for Direct {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Direct")
+            .field("executor", &self.executor)
+            .field("address", &self.address)
+            .field("withdrawn", &self.ticket.is_empty())
+            .finish_non_exhaustive()
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -45,8 +67,10 @@ mod tests {
         let file = File { data: "hunter2".into(), path: "key".to_owned(), ..File::default() };
         let seat = Seat { task: "t".to_owned(), token: "hunter2".to_owned() };
         let register = Register { token: "hunter2".to_owned() };
-        let shown = format!("{variable:?} {file:?} {seat:?} {register:?}");
+        let ticket = Ticket { executor: "e-1".to_owned(), secret: b"hunter2".to_vec() };
+        let direct = Direct { ticket: b"hunter2".as_slice().into(), ..Direct::default() };
+        let shown = format!("{variable:?} {file:?} {ticket:?} {direct:?} {seat:?} {register:?}");
         assert!(shown.contains("TOKEN") && shown.contains("key"), "{shown}");
-        assert!(!shown.contains("hunter2"), "{shown}");
+        assert!(!shown.contains("hunter2") && !shown.contains("104, 117"), "{shown}");
     }
 }

@@ -29,6 +29,7 @@
 //! | [`node_health`] | when a node counts as lost |
 //! | [`taskset`] | which tasks of a TaskSet begin, end and follow each other |
 //! | [`stray`] | what an agent runs and should not |
+//! | [`ticket`] | who may exchange messages with an agent directly |
 //! | [`upkeep`] | when a node is out of service for its battery or for people's work |
 //! | [`report`] | typed reasons, with the words people read |
 #![deny(missing_docs)]
@@ -55,4 +56,5 @@ pub mod schedule;
 pub mod space;
 pub mod stray;
 pub mod taskset;
+pub mod ticket;
 pub mod upkeep;

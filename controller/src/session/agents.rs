@@ -21,7 +21,7 @@ use muster_api::wire::agent::v1 as wire;
 use muster_api::wire::agent_session::{NodeReport, node_order};
 use muster_controller_core::node_health::{DETECT_AFTER, HEARTBEAT_EVERY};
 use muster_controller_core::stray::Strays;
-use tokio::sync::{Notify, mpsc};
+use tokio::sync::{Notify, mpsc, watch};
 use tokio_stream::wrappers::ReceiverStream;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
@@ -102,6 +102,12 @@ impl AgentService for Agents {
     }
 }
 
+/// What others say to the agent through its session.
+struct Relayed {
+    messages: mpsc::Receiver<wire::ControllerMessage>,
+    tickets: watch::Receiver<wire::Tickets>,
+}
+
 pub(super) struct Session {
     pub(super) context: Arc<Context>,
     pub(super) sessions: Arc<Sessions>,
@@ -155,12 +161,15 @@ impl Session {
         };
         let speaker = self.speaker(&hello)?;
         self.sessions.board().ready().await;
-        let (outbound, mut relayed) = mpsc::channel(OUTBOUND);
+        let (outbound, messages) = mpsc::channel(OUTBOUND);
+        let (to_agent, tickets) = watch::channel(wire::Tickets::default());
+        let mut relayed = Relayed { messages, tickets };
         let replaced = CancellationToken::new();
         let logs = Arc::default();
         let connection = Connection {
             id: self.id,
             outbound,
+            tickets: to_agent,
             logs: Arc::clone(&logs),
             replaced: replaced.clone(),
             written: Arc::default(),
@@ -217,7 +226,7 @@ impl Session {
         &mut self,
         speaker: &Speaker,
         wake: &Notify,
-        relayed: &mut mpsc::Receiver<wire::ControllerMessage>,
+        relayed: &mut Relayed,
         logs: &super::logs::Readers,
         replaced: &CancellationToken,
     ) -> Result<std::convert::Infallible, End> {
@@ -230,7 +239,12 @@ impl Session {
                 }
                 // Cancel safe: a permit that was not received stays.
                 () = wake.notified() => self.send_changed().await?,
-                Some(message) = relayed.recv() => self.send_message(message).await?,
+                Some(message) = relayed.messages.recv() => self.send_message(message).await?,
+                // Cancel safe: what was not marked as seen is a change again.
+                Ok(()) = relayed.tickets.changed() => {
+                    let tickets = relayed.tickets.borrow_and_update().clone();
+                    self.send(ToAgent::Tickets(tickets)).await?;
+                }
                 () = replaced.cancelled() => {
                     self.is_admitted()?;
                     return Err(Status::aborted("another session of this node has begun, or is asked for").into());
@@ -296,7 +310,7 @@ impl Session {
                 }
                 Ok(())
             }
-            Some(FromAgent::Executors(executors)) => self.take_executors(&executors.tasks).await,
+            Some(FromAgent::Executors(executors)) => self.take_executors(&executors).await,
             Some(FromAgent::Hello(_)) => Err(Status::invalid_argument("a second Hello").into()),
             None => Err(Status::invalid_argument("a message without a body").into()),
         }
@@ -333,10 +347,11 @@ impl Session {
         self.send(ToAgent::Heartbeat(wire::HeartbeatAck { sequence: heartbeat.sequence })).await
     }
 
-    async fn take_executors(&mut self, uids: &[String]) -> Result<(), End> {
+    async fn take_executors(&mut self, said: &wire::Executors) -> Result<(), End> {
         self.is_newest()?;
         let Some(live) = self.context.live() else { return Ok(()) };
-        let executors = live.frameworks.executors_on(&self.node, uids);
+        let executors = live.frameworks.executors_on(&self.node, &said.tasks);
+        live.frameworks.executors_at(&self.node, &said.address, &executors);
         // The scheduler ends only with the controller.
         live.scheduler.executors(self.node.clone(), executors).await.map_err(|_| End::Closed)
     }

@@ -35,7 +35,7 @@ use std::time::Duration;
 use muster_api::name::NodeName;
 use muster_api::wire::agent::v1 as wire;
 use muster_controller_core::node_health::{DETECT_AFTER, Monotonic, NodeHealth};
-use tokio::sync::{Notify, RwLock, RwLockReadGuard, RwLockWriteGuard, mpsc};
+use tokio::sync::{Notify, RwLock, RwLockReadGuard, RwLockWriteGuard, mpsc, watch};
 use tokio::time::Instant;
 
 use board::Board;
@@ -65,6 +65,8 @@ pub(crate) struct Connection {
     pub(crate) id: u64,
     /// Messages to the agent, beside its assignments.
     pub(crate) outbound: mpsc::Sender<wire::ControllerMessage>,
+    /// Who may exchange messages with its executors directly.
+    pub(crate) tickets: watch::Sender<wire::Tickets>,
     /// Logs being read.
     pub(crate) logs: Arc<logs::Readers>,
     /// Ends this session: a later one of the same node has begun.

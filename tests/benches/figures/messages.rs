@@ -1,8 +1,9 @@
 //! Framework → executor → framework, against a raw echo over TCP on loopback.
 //!
 //! ```text
-//!   floor:  client ⇄ TCP ⇄ echo                                                    2 sockets
-//!   ours:   framework ⇄ TLS, HTTP/2 ⇄ controller ⇄ TLS, HTTP/2 ⇄ agent ⇄ executor  6 sockets
+//!   floor:    client ⇄ TCP ⇄ echo                                                    2 sockets
+//!   directly: framework ⇄ TLS ⇄ agent ⇄ executor                                     4 sockets
+//!   relayed:  framework ⇄ TLS, HTTP/2 ⇄ controller ⇄ TLS, HTTP/2 ⇄ agent ⇄ executor  6 sockets
 //! ```
 //!
 //! Both sides of the floor read a message whole before they go on, as a message is. The echo of the floor is a thread of
@@ -13,8 +14,7 @@ use std::net::{TcpListener, TcpStream};
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
-use muster_sdk::{Event, EventStream, Framework, FrameworkHandle, Launch};
-use muster_tests::{AgentOptions, Cluster};
+use muster_tests::{AgentOptions, Cluster, Echo};
 
 use crate::stats::{Samples, figure};
 
@@ -50,72 +50,37 @@ impl Raw {
     }
 }
 
-/// A framework and its executor.
-struct Ours {
-    handle: FrameworkHandle,
-    events: EventStream,
-    executor: String,
-}
-
-impl Ours {
-    async fn start(cluster: &Cluster) -> Ours {
-        let connected = Framework::builder("messages").connect(Some(&cluster.kubeconfig())).await;
-        let (handle, mut events) = connected.expect("the kubeconfig is good");
-        let offer = loop {
-            if let Event::Offers(offers) = events.next().await.expect("it runs") {
-                break offers.into_iter().next().expect("an offer");
-            }
-        };
-        // Without a limit of cpu: the kernel's throttling is not what is measured.
-        let echo = Launch::process([env!("CARGO_BIN_EXE_echo-executor")]).memory("256Mi");
-        let launched = handle.launch_tasks([echo.on(&offer)]).await.expect("launched");
-        handle.suppress_offers().await.expect("taken");
-        let mut ours = Ours { handle, events, executor: launched[0].task.clone() };
-        assert_eq!(ours.answer().await, "ready");
-        ours
-    }
-
-    async fn answer(&mut self) -> Bytes {
-        loop {
-            match self.events.next().await.expect("it runs") {
-                Event::Message(message) => return message.data,
-                Event::Update(update) => self.handle.acknowledge_status_update(&update).await,
-                _ => {}
-            }
-        }
-    }
-
-    async fn round(&mut self, message: &Bytes) -> Duration {
-        let begin = Instant::now();
-        let sent = self.handle.send_framework_message(&self.executor, message.clone()).await;
-        sent.expect("its node is there");
-        let answer = self.answer().await;
-        let elapsed = begin.elapsed();
-        assert!(answer == *message, "{} bytes came back", answer.len());
-        elapsed
-    }
-}
-
 pub(crate) async fn round_trip() {
     let mut cluster = Cluster::start().await;
-    cluster.join(AgentOptions::cloud("cloud")).await;
-    let mut ours = Ours::start(&cluster).await;
+    cluster.join(AgentOptions::cloud("direct")).await;
+    cluster.join(AgentOptions::cloud("relayed").flag("--messages", "none")).await;
+    let mut direct = Echo::start(&cluster, "direct").await;
+    direct.go_directly(&cluster).await;
+    let mut relayed = Echo::start(&cluster, "relayed").await;
     for (size, pairs) in SIZES {
         let message = Bytes::from(vec![7; size]);
         let (mut raw, mut answer) = (Raw::new(size), vec![0; size]);
-        let (mut floor, mut through) = (Samples::default(), Samples::default());
+        let [mut floor, mut directly, mut through] = [(); 3].map(|()| Samples::default());
         for pair in 0..WARM_UP + pairs {
-            let (one, other) = (raw.round(&message, &mut answer), ours.round(&message).await);
+            let one = raw.round(&message, &mut answer);
+            let other = direct.round(&message).await;
+            let last = relayed.round(&message).await;
             if pair >= WARM_UP {
                 floor.push(one);
-                through.push(other);
+                directly.push(other);
+                through.push(last);
             }
         }
         floor.line(&format!("floor: TCP echo, {size} B"));
-        through.line(&format!("framework - executor - framework, {size} B"));
-        let ratio = through.median().as_secs_f64() / floor.median().as_secs_f64();
+        directly.line(&format!("framework - agent - executor, {size} B"));
+        through.line(&format!("the same through the controller, {size} B"));
+        let ratio =
+            |samples: &Samples| samples.median().as_secs_f64() / floor.median().as_secs_f64();
         let aim = if size == 1 << 20 { "<= 5x" } else { "none: hops, not bytes" };
-        figure(&format!("p50 ratio at {size} B"), ratio, "x", aim);
+        figure(&format!("p50 ratio at {size} B"), ratio(&directly), "x", aim);
+        figure(&format!("through the controller at {size} B"), ratio(&through), "x", "report");
     }
-    ours.handle.stop(false).await.expect("it is torn down");
+    for echo in [direct, relayed] {
+        echo.handle.stop(false).await.expect("it is torn down");
+    }
 }

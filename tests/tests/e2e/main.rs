@@ -10,6 +10,7 @@ mod figure4;
 mod frameworks;
 mod gate;
 mod lease;
+mod messages;
 mod missions;
 mod poses;
 mod preemption;

@@ -218,7 +218,9 @@ class Session:
                 put(inbox.Offered(offers))
         elif kind == "message":
             said = event.message
-            put(inbox.Message(said.executor, said.node, said.data))
+            # A mark is for the session before, which exchanged messages with the agent directly.
+            if not said.mark:
+                put(inbox.Message(said.executor, said.node, said.data))
         elif kind == "node_lost":
             put(inbox.NodeLost(event.node_lost.node, event.node_lost.message))
         elif kind == "executor_lost":

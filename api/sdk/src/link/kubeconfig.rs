@@ -63,6 +63,11 @@ impl Target {
     pub(crate) fn tls(&self) -> Result<ClientConfig, rustls::Error> {
         tls::mutual(&self.ca, &self.certificate, &self.key)
     }
+
+    /// The same, for agents that are dialled directly.
+    pub(crate) fn direct_tls(&self) -> Result<ClientConfig, rustls::Error> {
+        tls::direct(&self.ca, &self.certificate, &self.key)
+    }
 }
 
 #[derive(Debug, Default, Deserialize)]

@@ -21,6 +21,7 @@ use tokio::time::Instant;
 use tokio_stream::wrappers::ReceiverStream;
 use tokio_util::sync::CancellationToken;
 
+use super::direct::{Lanes, Outgoing, Relayed};
 use super::kubeconfig::Address;
 use super::pending::{Answered, Pending};
 use super::seen::{Seen, Verdict};
@@ -59,6 +60,20 @@ const MISSED_HEARTBEATS: u32 = 5;
 pub(crate) enum Command {
     Call { say: Box<Say>, answer: Answered },
     Acknowledge { task: String, version: u64 },
+}
+
+/// What the session is told to say, and the lanes that it tells what it hears of messages. The lanes end with it.
+#[derive(Debug)]
+pub(crate) struct Inbox {
+    pub(crate) commands: mpsc::Receiver<Command>,
+    pub(crate) relayed: mpsc::UnboundedReceiver<Relayed>,
+    pub(crate) lanes: Lanes,
+}
+
+impl Drop for Inbox {
+    fn drop(&mut self) {
+        self.lanes.close();
+    }
 }
 
 /// Where the controller is and how it is talked to.
@@ -124,7 +139,7 @@ pub(crate) struct Session {
     subscribed: bool,
     pending: Pending,
     seen: Seen,
-    commands: mpsc::Receiver<Command>,
+    inbox: Inbox,
     events: Outlet,
     stop: CancellationToken,
 }
@@ -140,7 +155,7 @@ impl Session {
     pub(crate) fn new(
         link: Link,
         identity: Identity,
-        commands: mpsc::Receiver<Command>,
+        inbox: Inbox,
         events: Outlet,
         stop: CancellationToken,
     ) -> Self {
@@ -152,7 +167,7 @@ impl Session {
             subscribed: false,
             pending: Pending::default(),
             seen: Seen::default(),
-            commands,
+            inbox,
             events,
             stop,
         }
@@ -218,7 +233,8 @@ impl Session {
                     }
                 }
                 // Closed: every handle is gone, and what happens is still of interest.
-                Some(command) = self.commands.recv() => self.command(command, &line).await?,
+                Some(command) = self.inbox.commands.recv() => self.command(command, &line).await?,
+                Some(relayed) = self.inbox.relayed.recv() => self.relay(relayed, &line).await?,
                 () = tokio::time::sleep_until(deaf_at) => {
                     return Err(End::Broken(Broken::Deaf(line.deaf_after)));
                 }
@@ -269,6 +285,8 @@ impl Session {
         self.events.send(if reregistered {
             Event::Reregistered
         } else {
+            // Executors of an earlier one are not this one's.
+            self.inbox.lanes.forget();
             Event::Registered { framework_id }
         });
     }
@@ -307,9 +325,19 @@ impl Session {
                     return line.acknowledge(update.task, update.version).await;
                 }
             },
-            Hear::Message(message) => Event::Message(message),
+            Hear::Message(message) => {
+                self.inbox.lanes.relayed(message);
+                return Ok(());
+            }
+            Hear::Direct(direct) => {
+                self.inbox.lanes.told(direct);
+                return Ok(());
+            }
             Hear::NodeLost(lost) => Event::NodeLost(lost),
-            Hear::ExecutorLost(lost) => Event::ExecutorLost(lost),
+            Hear::ExecutorLost(lost) => {
+                self.inbox.lanes.lost(&lost.executor);
+                Event::ExecutorLost(lost)
+            }
             Hear::Answer(answer) => return self.answer(answer),
             Hear::Error(error) => return Err(self.told(error)),
             Hear::Heartbeat(_) => return Ok(()),
@@ -334,6 +362,23 @@ impl Session {
             _ => {}
         }
         Ok(())
+    }
+
+    async fn relay(&mut self, relayed: Relayed, line: &Line) -> Result<(), End> {
+        match relayed {
+            Relayed::Message { executor, outgoing } => {
+                let Outgoing { data, answered, room } = outgoing;
+                let message = proto::Message { executor, data, ..proto::Message::default() };
+                line.say(self.pending.add(Say::Message(message), answered)).await?;
+                drop(room);
+                Ok(())
+            }
+            Relayed::Mark { executor, line: mark } => {
+                let mark = mark.number();
+                let message = proto::Message { executor, mark, ..proto::Message::default() };
+                line.say(proto::Call { id: String::new(), call: Some(Say::Message(message)) }).await
+            }
+        }
     }
 
     async fn command(&mut self, command: Command, line: &Line) -> Result<(), End> {

@@ -4,11 +4,12 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use hyper_util::rt::TokioIo;
+use muster_api::direct::ALPN;
 use muster_api::wire::{HTTP2_FRAME, HTTP2_WINDOW, READ_BUFFER};
-use rustls::crypto::ring;
+use rustls::crypto::{CryptoProvider, ring};
 use rustls::pki_types::pem::PemObject as _;
 use rustls::pki_types::{CertificateDer, PrivateKeyDer, ServerName};
-use rustls::{CertificateError, ClientConfig, Error, RootCertStore};
+use rustls::{CertificateError, CipherSuite, ClientConfig, Error, RootCertStore};
 use tokio::io::BufReader;
 use tokio::net::TcpStream;
 use tokio_rustls::TlsConnector;
@@ -20,8 +21,27 @@ use super::kubeconfig::Address;
 /// A connection in one building is up in milliseconds, over a bad radio link in seconds.
 const PATIENCE: Duration = Duration::from_secs(10);
 
-/// Believes the kubeconfig's CA and shows its client certificate.
+/// For the controller.
 pub(crate) fn mutual(ca: &[u8], certificate: &[u8], key: &[u8]) -> Result<ClientConfig, Error> {
+    config(ring::default_provider(), b"h2", (ca, certificate, key))
+}
+
+/// For agents. Of the ciphers the one with the shorter key comes first: it is as good, and large messages are what these
+/// connections are for.
+pub(crate) fn direct(ca: &[u8], certificate: &[u8], key: &[u8]) -> Result<ClientConfig, Error> {
+    let mut provider = ring::default_provider();
+    provider
+        .cipher_suites
+        .sort_by_key(|suite| suite.suite() != CipherSuite::TLS13_AES_128_GCM_SHA256);
+    config(provider, ALPN, (ca, certificate, key))
+}
+
+/// Believes the kubeconfig's CA and shows its client certificate.
+fn config(
+    provider: CryptoProvider,
+    protocol: &[u8],
+    (ca, certificate, key): (&[u8], &[u8], &[u8]),
+) -> Result<ClientConfig, Error> {
     let bad = |_| Error::InvalidCertificate(CertificateError::BadEncoding);
     let mut roots = RootCertStore::empty();
     for authority in CertificateDer::pem_slice_iter(ca) {
@@ -30,11 +50,11 @@ pub(crate) fn mutual(ca: &[u8], certificate: &[u8], key: &[u8]) -> Result<Client
     let chain: Vec<CertificateDer<'static>> =
         CertificateDer::pem_slice_iter(certificate).collect::<Result<_, _>>().map_err(bad)?;
     let key = PrivateKeyDer::from_pem_slice(key).map_err(bad)?;
-    let mut config = ClientConfig::builder_with_provider(Arc::new(ring::default_provider()))
+    let mut config = ClientConfig::builder_with_provider(Arc::new(provider))
         .with_safe_default_protocol_versions()?
         .with_root_certificates(roots)
         .with_client_auth_cert(chain, key)?;
-    config.alpn_protocols = vec![b"h2".to_vec()];
+    config.alpn_protocols = vec![protocol.to_vec()];
     Ok(config)
 }
 

@@ -14,7 +14,7 @@ use hyper_util::service::TowerToHyperService;
 use muster_api::wire::framework::v1 as proto;
 use proto::call::Call as Say;
 use proto::event::Event as Tell;
-use rcgen::{BasicConstraints, CertificateParams, CertifiedIssuer, IsCa, KeyPair};
+use rcgen::{BasicConstraints, Certificate, CertificateParams, CertifiedIssuer, IsCa, KeyPair};
 use rustls::pki_types::PrivateKeyDer;
 use rustls::pki_types::pem::PemObject as _;
 use rustls::server::WebPkiClientVerifier;
@@ -82,6 +82,7 @@ impl Session {
     }
 
     /// Waits until the framework has left.
+    #[allow(dead_code, clippy::allow_attributes, reason = "each test binary uses its own part")]
     pub(crate) async fn left(&mut self) {
         while let Ok(Some(_)) = soon(self.calls.message()).await {}
     }
@@ -107,6 +108,7 @@ impl FrameworkService for Service {
 pub(crate) struct Controller {
     dir: TempDir,
     sessions: mpsc::UnboundedReceiver<Session>,
+    ca: CertifiedIssuer<'static, KeyPair>,
     _server: AbortOnDropHandle<()>,
 }
 
@@ -115,10 +117,11 @@ impl Controller {
         let dir = tempfile::tempdir().expect("a directory");
         let listener = TcpListener::bind("127.0.0.1:0").await.expect("a port");
         let port = listener.local_addr().expect("bound").port();
-        let tls = credentials(port, &dir);
+        let ca = authority();
+        let tls = credentials(port, &dir, &ca);
         let (to_test, sessions) = mpsc::unbounded_channel();
         let server = AbortOnDropHandle::new(tokio::spawn(serve(listener, tls, Service(to_test))));
-        Controller { dir, sessions, _server: server }
+        Controller { dir, sessions, ca, _server: server }
     }
 
     pub(crate) fn kubeconfig(&self) -> PathBuf {
@@ -129,24 +132,39 @@ impl Controller {
         self.dir.path().join(name)
     }
 
+    /// TLS of the agent for which `name` stands.
+    #[allow(dead_code, clippy::allow_attributes, reason = "each test binary uses its own part")]
+    pub(crate) fn agent_tls(&self, name: &str) -> rustls::ServerConfig {
+        let (certificate, key) = leaf(&self.ca, vec![name.to_owned()]);
+        server_tls(&self.ca, &certificate, &key, muster_api::direct::ALPN)
+    }
+
     pub(crate) async fn session(&mut self) -> Session {
         soon(self.sessions.recv()).await.expect("a session")
     }
 }
 
-/// Writes the kubeconfig and gives the server's side of it.
-fn credentials(port: u16, dir: &TempDir) -> rustls::ServerConfig {
+fn authority() -> CertifiedIssuer<'static, KeyPair> {
     let mut params = CertificateParams::default();
     params.is_ca = IsCa::Ca(BasicConstraints::Unconstrained);
-    let ca = CertifiedIssuer::self_signed(params, KeyPair::generate().expect("a key"));
-    let ca = ca.expect("a CA");
-    let leaf = |names: Vec<String>| {
-        let key = KeyPair::generate().expect("a key");
-        let params = CertificateParams::new(names).expect("names");
-        (params.signed_by(&key, &ca).expect("signed"), key.serialize_pem())
-    };
-    let (client, client_key) = leaf(Vec::new());
-    let (server, server_key) = leaf(vec!["127.0.0.1".to_owned()]);
+    CertifiedIssuer::self_signed(params, KeyPair::generate().expect("a key")).expect("a CA")
+}
+
+/// A certificate for these names, and its key as PEM.
+fn leaf(ca: &CertifiedIssuer<'static, KeyPair>, names: Vec<String>) -> (Certificate, String) {
+    let key = KeyPair::generate().expect("a key");
+    let params = CertificateParams::new(names).expect("names");
+    (params.signed_by(&key, ca).expect("signed"), key.serialize_pem())
+}
+
+/// Writes the kubeconfig and gives the server's side of it.
+fn credentials(
+    port: u16,
+    dir: &TempDir,
+    ca: &CertifiedIssuer<'static, KeyPair>,
+) -> rustls::ServerConfig {
+    let (client, client_key) = leaf(ca, Vec::new());
+    let (server, server_key) = leaf(ca, vec!["127.0.0.1".to_owned()]);
     let text = format!(
         "clusters: [{{name: c, cluster: {{server: 'https://127.0.0.1:{port}', certificate-authority-data: {ca}}}}}]
 users: [{{name: u, user: {{client-certificate-data: {certificate}, client-key-data: {key}}}}}]
@@ -158,19 +176,28 @@ current-context: c
         key = STANDARD.encode(client_key),
     );
     std::fs::write(dir.path().join("config"), text).expect("written");
+    server_tls(ca, &server, &server_key, b"h2")
+}
+
+fn server_tls(
+    ca: &CertifiedIssuer<'static, KeyPair>,
+    certificate: &Certificate,
+    key: &str,
+    protocol: &[u8],
+) -> rustls::ServerConfig {
     let provider = Arc::new(rustls::crypto::ring::default_provider());
     let mut roots = rustls::RootCertStore::empty();
     roots.add(ca.der().clone()).expect("a CA");
     let verifier =
         WebPkiClientVerifier::builder_with_provider(Arc::new(roots), Arc::clone(&provider));
-    let key = PrivateKeyDer::from_pem_slice(server_key.as_bytes()).expect("a key");
+    let key = PrivateKeyDer::from_pem_slice(key.as_bytes()).expect("a key");
     let mut config = rustls::ServerConfig::builder_with_provider(provider)
         .with_safe_default_protocol_versions()
         .expect("versions")
         .with_client_cert_verifier(verifier.build().expect("a verifier"))
-        .with_single_cert(vec![server.der().clone()], key)
+        .with_single_cert(vec![certificate.der().clone()], key)
         .expect("a certificate");
-    config.alpn_protocols = vec![b"h2".to_vec()];
+    config.alpn_protocols = vec![protocol.to_vec()];
     config
 }
 

@@ -13,11 +13,13 @@
 //! | `subscribe` | the first call: who it is, and its Framework object |
 //! | `launch` | the launches of an Accept → checked Task objects |
 //! | `roster` | the tasks of all frameworks |
+//! | `direct` | tickets, with which messages go by without the controller |
 //! | [`updates`] | states of tasks → the mailboxes of their frameworks |
 //! | [`service`], [`lines`] | the two transports |
 //! | `convert` | what is said, as messages |
 
 pub(crate) mod convert;
+mod direct;
 mod launch;
 pub mod lines;
 mod roster;
@@ -94,6 +96,8 @@ impl Mailbox {
 #[derive(Debug, Clone)]
 struct Open {
     outlet: Outlet,
+    /// It can dial agents.
+    direct: bool,
     mailbox: Arc<Mailbox>,
     /// For calls that come over HTTP.
     calls: mpsc::Sender<wire::Call>,
@@ -115,6 +119,7 @@ pub struct Frameworks {
     /// Tasks that registered or spoke as executors, and the frameworks that they belong to.
     executors: Mutex<HashMap<String, FrameworkUid>>,
     roster: roster::Roster,
+    doors: direct::Doors,
 }
 
 impl Frameworks {
@@ -136,6 +141,7 @@ impl Frameworks {
             next_session: AtomicU64::new(1),
             executors: Mutex::default(),
             roster: roster::Roster::default(),
+            doors: direct::Doors::default(),
         }
     }
 
@@ -214,6 +220,7 @@ impl Frameworks {
         // The desk ends only with the controller.
         let _ = self.scheduler.desk(Request::Remove { uid: uid.into() }).await;
         lock(&self.executors).retain(|_, owner| **owner != *uid);
+        self.nobody_dials(&uid.into());
     }
 
     /// From an executor of a node's agent to its framework. At most once: lost when the framework is away.
@@ -223,8 +230,14 @@ impl Frameworks {
             tracing::warn!(%node, executor = message.executor, "a message of no framework's executor is dropped");
             return;
         };
-        let AgentMessage { executor, data } = message;
-        let message = wire::Message { executor, node: node.to_string(), data };
+        let AgentMessage { executor, data, mark } = message;
+        if mark == 0 {
+            direct::count("from_executor");
+        } else if !lock(&self.open).get(&*owner).is_some_and(|open| open.direct) {
+            // It was meant for a session before this one, which could dial.
+            return;
+        }
+        let message = wire::Message { executor, node: node.to_string(), data, mark };
         self.say(&owner, wire::event::Event::Message(message));
     }
 
@@ -266,8 +279,11 @@ impl Frameworks {
             return Err("the executor is another framework's");
         }
         let connection = self.agents.connection(&node).ok_or("its node is not connected")?;
-        let body =
-            ToAgent::Message(AgentMessage { executor: message.executor, data: message.data });
+        let wire::Message { executor, data, mark, .. } = message;
+        if mark == 0 {
+            direct::count("to_executor");
+        }
+        let body = ToAgent::Message(AgentMessage { executor, data, mark });
         let message = ControllerMessage { body: Some(body) };
         connection
             .outbound
@@ -281,6 +297,7 @@ impl Frameworks {
 
     pub(crate) fn forget_executor(&self, uid: &str) {
         lock(&self.executors).remove(uid);
+        self.not_dialled(uid);
     }
 
     fn calls_of(&self, session_id: &str) -> Option<mpsc::Sender<wire::Call>> {

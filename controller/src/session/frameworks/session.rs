@@ -112,7 +112,8 @@ async fn serve(frameworks: Arc<Frameworks>, wire: Wire, guest: Guest) {
     let (uid, key) = (Arc::clone(&session.guest.uid), session.guest.key.clone());
     tracing::info!(framework = %key, id = %uid, returned = session.guest.returned, "framework subscribed");
     let calls = wire.keep_calls.unwrap_or_else(|| mpsc::channel(1).0);
-    let open = Open { outlet: outlet.clone(), mailbox, calls, cut: cut.clone() };
+    let direct = session.guest.direct;
+    let open = Open { outlet: outlet.clone(), direct, mailbox, calls, cut: cut.clone() };
     frameworks.connect(&uid, &session_id, open);
     let ended = {
         let worked = pin!(session.work(&session_id, outlet, wire.calls, &mut told));
@@ -164,6 +165,7 @@ impl Session {
             outlet,
         })
         .await?;
+        self.frameworks.may_dial(&self.guest.uid, self.number, self.guest.direct);
         self.tell_what_is_open();
         let mut beat = interval(HEARTBEAT_EVERY);
         beat.set_missed_tick_behavior(MissedTickBehavior::Delay);
@@ -443,6 +445,7 @@ impl Session {
     async fn leave(self, session_id: &str) {
         let Session { frameworks, guest, number, .. } = self;
         // The desk ends only with the controller.
+        frameworks.may_not_dial(&guest.uid, number);
         let leave = Request::Leave { uid: Arc::clone(&guest.uid), session: number };
         let _ = frameworks.scheduler.desk(leave).await;
         if frameworks.disconnect(&guest.uid, session_id, number)

@@ -24,6 +24,8 @@ pub(super) struct Guest {
     pub(super) spec: FrameworkSpec,
     /// It was known before.
     pub(super) returned: bool,
+    /// It can dial agents.
+    pub(super) direct: bool,
 }
 
 /// Why a Subscribe is refused: one CamelCase word, and a sentence.
@@ -54,7 +56,8 @@ pub(super) async fn subscribe(
     let namespace = if call.namespace.is_empty() { DEFAULT } else { &call.namespace };
     let key = Key::namespaced(FRAMEWORKS, namespace, call.name.as_str());
     let Some(stored) = context.store.get(&key) else {
-        return register(context, key, spec, &call.framework_id).await;
+        let registered = register(context, key, spec, &call.framework_id).await?;
+        return Ok(Guest { direct: call.direct, ..registered });
     };
     if stored.mentions("deletionTimestamp") {
         return Err(Refused(
@@ -70,7 +73,7 @@ pub(super) async fn subscribe(
     }
     let uid: FrameworkUid = (*stored.uid).into();
     write_connected(context, &key, &uid, Some(&spec)).await?;
-    Ok(Guest { uid, key, spec, returned: true })
+    Ok(Guest { uid, key, spec, returned: true, direct: call.direct })
 }
 
 fn in_the_way(frameworks: &Frameworks, key: &Key, stored: &Stored) -> String {
@@ -111,7 +114,7 @@ async fn register(
     })?;
     let uid: FrameworkUid = (*stored.uid).into();
     write_connected(context, &key, &uid, None).await?;
-    Ok(Guest { uid, key, spec, returned: false })
+    Ok(Guest { uid, key, spec, returned: false, direct: false })
 }
 
 /// Writes that a session is open.
