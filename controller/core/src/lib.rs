@@ -26,6 +26,8 @@
 //! | [`recent`] | one allocation for what many nodes or tasks have in common |
 //! | [`node_health`] | when a node counts as lost |
 //! | [`taskset`] | which tasks of a TaskSet begin, end and follow each other |
+//! | [`offload`] | where the parts of an Application run, and why (AnyScale) |
+//! | [`simulation`] | nothing: it runs [`offload`] over random worlds, seeded |
 //! | [`stray`] | what an agent runs and should not |
 //! | [`upkeep`] | when a node is out of service for its battery or for people's work |
 //! | [`report`] | typed reasons, with the words people read |
@@ -42,12 +44,14 @@ pub mod hold;
 pub mod ledger;
 pub mod node_health;
 pub mod offer;
+pub mod offload;
 pub mod poses;
 pub mod preempt;
 pub mod quota;
 pub mod recent;
 pub mod report;
 pub mod schedule;
+pub mod simulation;
 pub mod space;
 pub mod stray;
 pub mod taskset;

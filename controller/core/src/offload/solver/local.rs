@@ -74,11 +74,14 @@ fn shift(state: &mut State<'_>, item: usize, options: &Options, budget: &mut Bud
 fn exchange(state: &mut State<'_>, item: usize, options: &Options, budget: &mut Budget) {
     for other in 0..options.len() {
         let (from, to) = (state.mapping[item], state.mapping[other]);
-        if other == item || from == to || to == HOME || !options[item].contains(&to) {
-            continue;
-        }
+        budget.spend(1);
         if budget.is_spent() {
             return;
+        }
+        // What was struck out may be part of something as good; what is not allowed may not.
+        let allowed = state.problem().items[item].allowed[to];
+        if other == item || from == to || to == HOME || !allowed {
+            continue;
         }
         let before = state.value;
         state.take(item);

@@ -17,7 +17,7 @@ mod state;
 mod tests;
 
 use super::constraint::check;
-use super::problem::{Mapping, Problem};
+use super::problem::{HOME, Mapping, Problem};
 use dual::Dual;
 use forest::Forest;
 use local::BETTER;
@@ -29,7 +29,7 @@ type Options = Vec<Vec<usize>>;
 /// How much a decision may look at.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Effort {
-    /// Options that the search may look at. A few million take about 10 ms.
+    /// Places of parts that the search may look at; each look is at all of them.
     pub search: u64,
     /// Options that the prices may look at, and the improvements.
     pub prepare: u64,
@@ -37,7 +37,7 @@ pub struct Effort {
 
 impl Effort {
     /// For a decision that is made every period.
-    pub const ONLINE: Effort = Effort { search: 1_000_000, prepare: 1_000_000 };
+    pub const ONLINE: Effort = Effort { search: 400_000, prepare: 1_000_000 };
     /// Until it is proven.
     pub const UNLIMITED: Effort = Effort { search: u64::MAX, prepare: 20_000_000 };
 }
@@ -108,18 +108,64 @@ pub fn solve(problem: &Problem, start: &[usize], effort: Effort) -> Option<Solut
     let dual = prepare(&empty, &forest, &mut options, &mut best, effort);
     let mut bound = dual.bound;
     let mut looked_at = 0;
-    if best.as_ref().is_none_or(|b| bound > b.value + BETTER * b.value.abs()) {
-        let mut search = search::Search::new(problem, &forest, (&dual, &options), effort.search);
+    let few = effort.search / LEAST_LOOKS < (problem.items.len() * problem.scales.len()) as u64;
+    if !few && best.as_ref().is_none_or(|b| bound > b.value + BETTER * b.value.abs()) {
+        let all = (&dual, &options);
+        let mut search = search::Search::new(problem, &forest, all, effort.search / 2);
         search.run(&empty, best.as_ref());
         (looked_at, bound) = (search.looked_at(), search.bound(bound));
         if let Some(found) = search.into_best() {
             keep_better(&mut best, State::of(problem, &neighbours, &found));
+        }
+        if looked_at >= effort.search / 2 {
+            let mut budget = Budget { left: effort.search / 2 };
+            polish(&empty, &forest, all, &mut best, &mut budget);
+            looked_at = effort.search - budget.left;
         }
     }
     let best = best?;
     let mapping = local::checked(problem, &best)?;
     let value = problem.value(&mapping);
     Some(Solution { bound: bound.max(value), mapping, value, looked_at })
+}
+
+/// Searches around the best mapping: the parts of two scales and of home anew, the others where they are; for each two
+/// scales, again while that helps.
+fn polish<'a>(
+    empty: &State<'a>,
+    forest: &Forest,
+    (dual, options): (&Dual, &Options),
+    best: &mut Option<State<'a>>,
+    budget: &mut Budget,
+) {
+    let problem = empty.problem();
+    let scales = problem.scales.len();
+    let pairs = || (1..scales).flat_map(|i| (i + 1..scales).map(move |j| (i, j)));
+    loop {
+        let before = best.as_ref().map_or(f64::NEG_INFINITY, |b| b.value);
+        for (i, j) in pairs() {
+            let Some(mapping) = best.as_ref().map(|b| b.mapping.clone()) else { return };
+            let free = |k: usize| k == HOME || k == i || k == j;
+            let of = |(item, all): (usize, &Vec<usize>)| match mapping[item] {
+                k if free(k) => all.iter().copied().filter(|k| free(*k)).collect(),
+                k => vec![k],
+            };
+            let near: Options = options.iter().enumerate().map(of).collect();
+            let mut search =
+                search::Search::new(problem, forest, (dual, &near), budget.left.min(POLISH));
+            search.run(empty, best.as_ref());
+            budget.spend(search.looked_at());
+            if let Some(found) = search.into_best() {
+                keep_better(best, State::of(problem, empty.all_neighbours(), &found));
+            }
+            if budget.is_spent() {
+                return;
+            }
+        }
+        if best.as_ref().is_none_or(|b| b.value <= before + BETTER * before.abs()) {
+            return;
+        }
+    }
 }
 
 /// The scales where each part may be and would fit by itself.
@@ -148,10 +194,15 @@ fn try_construct<'a>(
     }
 }
 
-/// Rounds of prices, each with a better mapping to aim at and fewer options than the one before.
-const ROUNDS: usize = 3;
+/// Rounds of prices, each with a better mapping to aim at and fewer options than the one before. Each gives a mapping of
+/// its own, too.
+const ROUNDS: usize = 8;
 /// Steps for the prices of one round, if the effort allows them.
-const STEPS: usize = 120;
+const STEPS: usize = 40;
+/// A search of fewer looks finds nothing that the preparation did not.
+const LEAST_LOOKS: u64 = 100;
+/// Places that one search around the best mapping may look at.
+const POLISH: u64 = 40_000;
 
 fn prepare<'a>(
     empty: &State<'a>,
@@ -170,26 +221,24 @@ fn prepare<'a>(
         let next = Dual::solve(problem, forest, options, (known, steps), dual.as_ref());
         let mut budget = Budget { left: effort.prepare / (4 * ROUNDS as u64) };
         try_construct(best, empty, (options, &next.worth), &mut budget);
-        let struck = best.as_ref().is_some_and(|b| strike_out(options, forest, &next, b.value));
+        let known = best.as_ref().map_or(f64::NEG_INFINITY, |b| b.value);
+        let proven = next.bound <= known + BETTER * known.abs();
+        strike_out(options, forest, &next, known);
         dual = Some(next);
-        if !struck {
+        if proven {
             break;
         }
     }
     dual.unwrap_or_else(|| Dual::solve(problem, forest, options, (0.0, 0), None))
 }
 
-/// Strikes out what cannot be part of anything better than `known`. Says whether there was any.
-fn strike_out(options: &mut Options, forest: &Forest, dual: &Dual, known: f64) -> bool {
-    let mut struck = false;
+/// Strikes out what cannot be part of anything better than `known`.
+fn strike_out(options: &mut Options, forest: &Forest, dual: &Dual, known: f64) {
     let least = known + BETTER * known.abs();
     for (part, options) in options.iter_mut().enumerate() {
         let with = |k: usize| dual.paid + dual.marginals.with(forest, part, k);
         let best = options.iter().map(|k| with(*k)).fold(f64::NEG_INFINITY, f64::max);
-        let before = options.len();
         // The best one stays in any case: a part has to be somewhere.
         options.retain(|k| with(*k) >= best || with(*k) > least);
-        struck |= options.len() < before;
     }
-    struck
 }

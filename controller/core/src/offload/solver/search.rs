@@ -45,7 +45,7 @@ impl<'p> Search<'p> {
             best: None,
             best_value: f64::NEG_INFINITY,
             open: f64::NEG_INFINITY,
-            worth: dual.worth.clone(),
+            worth: vec![f64::NEG_INFINITY; dual.worth.len()],
             marginals: dual.marginals.clone(),
         }
     }

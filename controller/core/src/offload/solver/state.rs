@@ -110,8 +110,8 @@ impl<'a> State<'a> {
         self.problem
     }
 
-    /// The parts that a part is connected with, and the traffic.
-    pub(super) fn neighbours(&self, item: usize) -> &'a [(usize, f64)] {
-        &self.neighbours[item]
+    /// For each part those that it is connected with, and the traffic.
+    pub(super) fn all_neighbours(&self) -> &'a [Vec<(usize, f64)>] {
+        self.neighbours
     }
 }
