@@ -381,13 +381,17 @@ mod tests {
 
     #[test]
     fn rates_read_decimal_units_of_bits() {
-        for (text, bits) in [("9600", 9_600), ("200k", 200_000), ("6M", 6_000_000), ("1.5G", 1_500_000_000)] {
+        for (text, bits) in
+            [("9600", 9_600), ("200k", 200_000), ("6M", 6_000_000), ("1.5G", 1_500_000_000)]
+        {
             assert_eq!(text.parse(), Ok(BitRate(bits)), "{text}");
             assert_eq!(BitRate(bits).to_string().parse(), Ok(BitRate(bits)), "{text}");
         }
-        for (text, suggestion) in
-            [("200Kb/s", "try \"200k\""), ("6Mbps", "try \"6M\""), ("fast", "try \"200k\" or \"6M\"")]
-        {
+        for (text, suggestion) in [
+            ("200Kb/s", "try \"200k\""),
+            ("6Mbps", "try \"6M\""),
+            ("fast", "try \"200k\" or \"6M\""),
+        ] {
             let error = text.parse::<BitRate>().expect_err(text);
             assert_eq!(error.suggestion(), suggestion, "{text}");
         }

@@ -102,7 +102,9 @@ fn scale_rules(spec: &ApplicationSpec, violations: &mut Violations) {
 /// A scale that is named by itself, while the others are named in a list, is a slip of the pen when it is not there.
 fn named_scale(spec: &ApplicationSpec, node: &str, path: &str, violations: &mut Violations) {
     if node == spec.home {
-        violations.invalid(path, "is home").suggest("what is so at home needs no name: leave it out");
+        violations
+            .invalid(path, "is home")
+            .suggest("what is so at home needs no name: leave it out");
     } else if spec.scales.selector.is_none()
         && !spec.scales.nodes.is_empty()
         && !spec.scales.nodes.iter().any(|n| n == node)

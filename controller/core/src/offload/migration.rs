@@ -172,9 +172,10 @@ impl Stage {
             },
             (_, Event::Gone(uid)) => self.gone(uid).unwrap_or_else(stay),
             (_, Event::CutOff { standby }) => self.cut_off(standby).unwrap_or_else(stay),
-            (Stage::Alone { lost, also, .. }, Event::Contact) => {
-                Step { stage: self, acts: [Some(lost), also].into_iter().flatten().map(Act::Stop).collect() }
-            }
+            (Stage::Alone { lost, also, .. }, Event::Contact) => Step {
+                stage: self,
+                acts: [Some(lost), also].into_iter().flatten().map(Act::Stop).collect(),
+            },
             (Stage::Settled { serves }, Event::Abort) => settle(serves),
             _ => stay(),
         }
@@ -204,7 +205,10 @@ impl Stage {
             Stage::Making { serves, next } | Stage::Switching { serves, next }
                 if serves.uid == uid =>
             {
-                Some(Step { stage: Stage::Settled { serves: next }, acts: vec![Act::Connect(next)] })
+                Some(Step {
+                    stage: Stage::Settled { serves: next },
+                    acts: vec![Act::Connect(next)],
+                })
             }
             _ => None,
         }
@@ -218,7 +222,9 @@ impl Stage {
         };
         let mut start = vec![Act::Start(standby), Act::Connect(standby)];
         match self {
-            Stage::Settled { serves } if serves.scale != home => alone(standby, serves, None, start),
+            Stage::Settled { serves } if serves.scale != home => {
+                alone(standby, serves, None, start)
+            }
             // On its way home: the one at home serves as soon as it can.
             Stage::Making { serves, next } | Stage::Switching { serves, next }
                 if next.scale == home =>

@@ -135,7 +135,8 @@ impl<'a> Case<'a> {
 
     /// The best that the policy knows, when nothing is broken.
     fn improve(&self) -> Decision {
-        let stay = |bound: f64| Decision { target: self.current.clone(), forced: Vec::new(), bound };
+        let stay =
+            |bound: f64| Decision { target: self.current.clone(), forced: Vec::new(), bound };
         let mut problem = self.problem.clone();
         let hysteresis = self.snapshot.model.objective.hysteresis;
         for (i, item) in problem.items.iter_mut().enumerate() {
@@ -400,8 +401,6 @@ fn edges(snapshot: &Snapshot<'_>, items: &[usize]) -> Vec<Edge> {
     let index = |part: usize| items.iter().position(|p| *p == part);
     let connections = snapshot.model.connections.iter();
     connections
-        .filter_map(|c| {
-            Some(Edge { a: index(c.from)?, b: index(c.to)?, traffic: c.bandwidth })
-        })
+        .filter_map(|c| Some(Edge { a: index(c.from)?, b: index(c.to)?, traffic: c.bandwidth }))
         .collect()
 }

@@ -25,13 +25,8 @@ fn at(seconds: f64) -> Timestamp {
 impl Bed {
     fn new() -> Self {
         let model = corridor();
-        let part = PartView {
-            scale: 0,
-            moving: false,
-            moved_at: None,
-            active: true,
-            learned: Vec::new(),
-        };
+        let part =
+            PartView { scale: 0, moving: false, moved_at: None, active: true, learned: Vec::new() };
         Bed {
             scales: vec![roomy("youbot", 1.0, at(0.0)), roomy("laptop", 3.5, at(0.0))],
             parts: vec![part; model.parts.len()],
@@ -94,11 +89,14 @@ fn tables_1_and_2_of_anyscale_leave_amcl_and_ar_to_move_and_amcl_goes_first() {
     assert_eq!(pins("ekf"), ["NoTolerance", "NoTolerance"]);
     assert_eq!(pins("odometry"), ["NoTolerance", "NoTolerance"]);
     assert_eq!((pins("user"), pins("map-server")), (vec!["Once"], vec!["Once"]));
-    let (cpu, traffic) = (|name| bed.model.parts[bed.part(name)].home_cpu(), |name: &str| {
-        let part = bed.part(name);
-        let of = bed.model.connections.iter().filter(|c| c.from == part || c.to == part);
-        of.map(|c| c.bandwidth).sum::<f64>()
-    });
+    let (cpu, traffic) = (
+        |name| bed.model.parts[bed.part(name)].home_cpu(),
+        |name: &str| {
+            let part = bed.part(name);
+            let of = bed.model.connections.iter().filter(|c| c.from == part || c.to == part);
+            of.map(|c| c.bandwidth).sum::<f64>()
+        },
+    );
     assert_eq!((cpu("amcl"), cpu("ar")), (0.5, 0.33));
     assert_eq!((traffic("amcl"), traffic("ar")), (200e3, 6e6));
     assert_eq!(bed.moves(1.0), [("amcl", 1, false), ("ar", 1, false)]);

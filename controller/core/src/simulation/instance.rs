@@ -50,11 +50,9 @@ const MIB: f64 = 1_048_576.0;
 #[must_use]
 pub fn draw(size: Size, supply: Supply, seed: u64) -> Problem {
     let mut numbers = Numbers::new(seed);
-    let gains: Vec<f64> = std::iter::once(1.0)
-        .chain((1..size.scales).map(|_| numbers.between(1.5, 4.0)))
-        .collect();
-    let items: Vec<Item> =
-        (0..size.migratable).map(|_| item(&mut numbers, &gains, size)).collect();
+    let gains: Vec<f64> =
+        std::iter::once(1.0).chain((1..size.scales).map(|_| numbers.between(1.5, 4.0))).collect();
+    let items: Vec<Item> = (0..size.migratable).map(|_| item(&mut numbers, &gains, size)).collect();
     let mut edges = Vec::new();
     for a in 1..size.migratable {
         if numbers.chance(1.0 / 3.0) {

@@ -51,7 +51,8 @@ impl Trace {
         let mut end = 0.0;
         let first = numbers.chance(0.5);
         for (up, down) in up.into_iter().zip(down) {
-            let both = if first { [(up, true), (down, false)] } else { [(down, false), (up, true)] };
+            let both =
+                if first { [(up, true), (down, false)] } else { [(down, false), (up, true)] };
             for (metres, covered) in both {
                 end += metres;
                 let carries = if covered { numbers.between(10e6, 54e6) } else { 0.0 };

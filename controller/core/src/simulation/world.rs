@@ -306,7 +306,8 @@ impl<'m> World<'m> {
             let ends = [connection.from, connection.to].map(|part| self.serves(part));
             let crossing = ends[0].0 != ends[1].0;
             let flows = ends.iter().all(|(_, serves)| *serves);
-            let bad = connection.min_hz.is_some() && !flows && (crossing || self.below[i].is_some());
+            let bad =
+                connection.min_hz.is_some() && !flows && (crossing || self.below[i].is_some());
             self.below[i] = if bad { self.below[i].or(Some(self.now)) } else { None };
         }
     }

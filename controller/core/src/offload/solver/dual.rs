@@ -136,7 +136,8 @@ impl Dual {
             }
         }
         for (k, scale) in problem.scales.iter().enumerate() {
-            let less = |o: &mut f64, capacity: f64| *o = if capacity.is_finite() { *o - 1.0 } else { 0.0 };
+            let less =
+                |o: &mut f64, capacity: f64| *o = if capacity.is_finite() { *o - 1.0 } else { 0.0 };
             less(&mut over.cpu[k], scale.cpu);
             less(&mut over.memory[k], scale.memory);
             less(&mut over.link[k], scale.bandwidth);

@@ -129,7 +129,8 @@ impl Marginals {
             };
             let apart = largest((0..n).map(|k| above(self, k) - ends[k]));
             for (k, end) in ends.iter().enumerate() {
-                self.with[part * n + k] = self.up[part * n + k] + larger(above(self, k), apart - end);
+                self.with[part * n + k] =
+                    self.up[part * n + k] + larger(above(self, k), apart - end);
             }
         }
     }

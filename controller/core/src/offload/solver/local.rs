@@ -29,7 +29,8 @@ pub(super) fn construct<'a>(
         }
         best[0] - best[1]
     };
-    let mut order: Vec<(f64, usize)> = (0..options.len()).map(|item| (regret(item), item)).collect();
+    let mut order: Vec<(f64, usize)> =
+        (0..options.len()).map(|item| (regret(item), item)).collect();
     order.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
     for (_, item) in order {
         let mut choices = options[item].clone();
@@ -110,5 +111,7 @@ fn exchange(state: &mut State<'_>, item: usize, options: &Options, budget: &mut 
 
 /// The mapping of a state, when it keeps every constraint that [`super::super::constraint::check`] knows.
 pub(super) fn checked(problem: &Problem, state: &State<'_>) -> Option<Mapping> {
-    super::super::constraint::check(problem, &state.mapping).is_empty().then(|| state.mapping.clone())
+    super::super::constraint::check(problem, &state.mapping)
+        .is_empty()
+        .then(|| state.mapping.clone())
 }

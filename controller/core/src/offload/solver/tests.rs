@@ -110,11 +110,15 @@ fn algorithm_1_takes_the_hungriest_part_to_the_strongest_scale() {
         memory: 0.0,
         traffic,
     };
-    let mut scales = vec![Capacity::unlimited(1.0), Capacity::unlimited(2.0), Capacity::unlimited(3.0)];
+    let mut scales =
+        vec![Capacity::unlimited(1.0), Capacity::unlimited(2.0), Capacity::unlimited(3.0)];
     scales[2].cpu = 0.6;
     scales[0].bandwidth = 10.0;
-    let problem =
-        Problem { items: vec![item(0.2, 1.0), item(0.5, 1.0), item(0.4, 9.0)], scales, edges: vec![] };
+    let problem = Problem {
+        items: vec![item(0.2, 1.0), item(0.5, 1.0), item(0.4, 9.0)],
+        scales,
+        edges: vec![],
+    };
     assert_eq!(greedy::step(&problem, &[0, 0, 0], |_| true), Some((1, 2)));
     // The strongest has no room for the next one; then the radio has none for the last.
     assert_eq!(greedy::step(&problem, &[0, 2, 0], |_| true), Some((2, 1)));
