@@ -4,6 +4,9 @@
 //! It does no more: no task is created, no link measured, nothing moved, and the condition `Managed` says so. What would be
 //! done is `muster_controller_core::offload::plan`.
 
+use std::sync::Arc;
+use std::time::Duration;
+
 use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 use muster_api::condition::{
@@ -16,12 +19,13 @@ use muster_controller_core::offload::constraint::Resource;
 use muster_controller_core::offload::model::Model;
 use muster_controller_core::offload::reason::{Stand, amount};
 
-use std::sync::Arc;
-
 use super::{again, next_events, watch_from_now};
 use crate::context::Context;
 use crate::objects::{self, APPLICATIONS, NODES};
 use crate::store::{Key, Op, StoreError};
+
+/// Between two looks: nodes change all the time, and who looks at an application does not see the difference.
+const EVERY: Duration = Duration::from_millis(250);
 
 /// Works until dropped.
 pub async fn run(context: Arc<Context>) {
@@ -33,6 +37,7 @@ async fn follow(context: &Context) -> Result<(), StoreError> {
     let mut watcher = watch_from_now(&context.store).await;
     loop {
         look(context).await?;
+        tokio::time::sleep(EVERY).await;
         loop {
             // Cancel safe: this is only dropped when the controller ends.
             let Some(events) = next_events(&mut watcher).await else { return Ok(()) };

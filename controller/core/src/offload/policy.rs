@@ -209,9 +209,9 @@ impl<'a> Case<'a> {
         // What is left out must not be what made room on a link.
         if !later.is_empty() && !self.holds(&mapping) {
             let forced = |i: usize| decision.forced.iter().any(|(item, _)| *item == i);
-            for item in 0..mapping.len() {
-                if mapping[item] != self.current[item] && !forced(item) && mapping[item] != HOME {
-                    mapping[item] = self.current[item];
+            for (item, scale) in mapping.iter_mut().enumerate() {
+                if *scale != self.current[item] && !forced(item) && *scale != HOME {
+                    *scale = self.current[item];
                     later.push(item);
                 }
             }

@@ -14,7 +14,7 @@ impl Trace {
     #[must_use]
     pub fn at(&self, place: f64) -> f64 {
         let stretch = self.stretches.iter().find(|(end, _)| place < *end);
-        stretch.or(self.stretches.last()).map_or(0.0, |(_, bandwidth)| *bandwidth)
+        stretch.or_else(|| self.stretches.last()).map_or(0.0, |(_, bandwidth)| *bandwidth)
     }
 
     /// A link that is up for 0.2 to 20 s and down for 0.1 to 6 s, in turn, for `seconds`; what it carries is between 0.1

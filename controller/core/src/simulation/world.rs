@@ -294,7 +294,7 @@ impl<'m> World<'m> {
                 Act::Connect(_) => runner.switched_at = Some(later(now, pace.switch)),
                 Act::Stop(attempt) => {
                     for process in runner.processes.iter_mut().filter(|p| p.attempt == attempt) {
-                        process.gone_at.get_or_insert(later(now, pace.stop));
+                        process.gone_at.get_or_insert_with(|| later(now, pace.stop));
                     }
                 }
             }

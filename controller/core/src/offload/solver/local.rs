@@ -73,7 +73,7 @@ fn shift(state: &mut State<'_>, item: usize, options: &Options, budget: &mut Bud
 
 /// Puts one part in another's place, and the other wherever it then is worth most.
 fn exchange(state: &mut State<'_>, item: usize, options: &Options, budget: &mut Budget) {
-    for other in 0..options.len() {
+    for (other, choices) in options.iter().enumerate() {
         let (from, to) = (state.mapping[item], state.mapping[other]);
         budget.spend(1);
         if budget.is_spent() {
@@ -89,7 +89,7 @@ fn exchange(state: &mut State<'_>, item: usize, options: &Options, budget: &mut 
         state.take(other);
         if state.try_put(item, to) {
             let mut best: Option<(f64, usize)> = None;
-            for &k in options[other].iter().filter(|k| **k != to) {
+            for &k in choices.iter().filter(|k| **k != to) {
                 budget.spend(1);
                 if state.try_put(other, k) {
                     if best.is_none_or(|(value, _)| state.value > value) {
