@@ -86,6 +86,14 @@ pub const PROGRESSING: &str = "Progressing";
 /// Of a TaskSet: some of its tasks cannot be created.
 pub const REPLICA_FAILURE: &str = "ReplicaFailure";
 
+/// Of an Application: muster runs its parts and moves them.
+pub const MANAGED: &str = "Managed";
+/// Of an Application: what it is and where it may run has been worked out from the newest spec.
+pub const CHARACTERISED: &str = "Characterised";
+/// Of an Application: the node that is its home exists and holds all of its parts at once, as it must when every link is
+/// lost.
+pub const FITS_HOME: &str = "FitsHome";
+
 /// Sets the condition of the same type, or adds it; the transition time moves only when the status
 /// changes. Says whether anything changed.
 pub fn set_condition(conditions: &mut Vec<Condition>, mut new: Condition, now: &Time) -> bool {

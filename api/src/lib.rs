@@ -4,12 +4,12 @@
 //!
 //! | module | holds |
 //! |---|---|
-//! | [`kind`] | the resources (Node, Task, TaskSet, Lease, Framework, Quota, Namespace, Event): spec, status, admission |
+//! | [`kind`] | the resources (Node, Task, TaskSet, Application, Lease, Framework, Quota, Namespace, Event): spec, status, admission |
 //! | [`manifest`] | YAML or JSON text → objects whose every field knows its file, line and column |
 //! | [`validate`] | violations (path, reason, suggestion) and the walk over a kind's schema |
 //! | [`selector`] | label and field selectors, both forms and their string grammar |
 //! | [`name`], [`id`] | names and identities as types |
-//! | [`quantity`], [`duration`], [`portion`] | cpu, bytes, time spans, numbers or percentages, with their units |
+//! | [`quantity`], [`duration`], [`portion`] | cpu, bytes, bit rates, time spans, numbers or percentages, with their units |
 //! | [`resource`] | CR, SR and AR: what nodes have and tasks ask for |
 //! | [`pose`] | where a robot is, in which map |
 //! | [`direct`] | messages that do not pass the controller: frames, tickets, which way each goes |

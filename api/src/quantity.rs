@@ -1,4 +1,4 @@
-//! Amounts with their units in the type: cpu in millicores, memory and rates in bytes.
+//! Amounts with their units in the type: cpu in millicores, memory and disk rates in bytes, network rates in bits a second.
 //!
 //! The text forms are Kubernetes' (`500m`, `1.5`, `256Mi`, `2G`), except that bytes cannot have
 //! the suffix `m`: nobody means a thousandth of a byte.
@@ -40,6 +40,10 @@ pub struct MilliCpu(pub u64);
 /// An amount of memory or storage, in bytes.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct Bytes(pub u64);
+
+/// What a network carries, in bits a second.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct BitRate(pub u64);
 
 impl MilliCpu {
     /// What is left after `other` is taken away; none when more is taken than there is.
@@ -91,6 +95,25 @@ impl FromStr for Bytes {
         let (number, suffix) = split_suffix(text.trim());
         let bytes = byte_unit(suffix).and_then(|unit| amount(number, unit));
         bytes.map(Bytes).ok_or_else(|| QuantityError::new(text, WHAT, suggest_bytes(text)))
+    }
+}
+
+impl FromStr for BitRate {
+    type Err = QuantityError;
+
+    fn from_str(text: &str) -> Result<Self, QuantityError> {
+        const WHAT: &str = "a rate in bits a second";
+        let (number, suffix) = split_suffix(text.trim());
+        let unit = match suffix {
+            "" => Some(1),
+            "k" => Some(1_000),
+            "M" => Some(1_000_000),
+            "G" => Some(1_000_000_000),
+            "T" => Some(1_000_000_000_000),
+            _ => None,
+        };
+        let bits = unit.and_then(|unit| amount(number, unit));
+        bits.map(BitRate).ok_or_else(|| QuantityError::new(text, WHAT, suggest_rate(text)))
     }
 }
 
@@ -186,6 +209,31 @@ fn suggest_bytes(text: &str) -> String {
         _ => "Mi",
     };
     format!("try \"{number}{unit}\"")
+}
+
+/// People write `200kbit`, `6 Mb/s` or `6Mbps`; the letter tells.
+fn suggest_rate(text: &str) -> String {
+    let Some(number) = leading_number(text) else {
+        return "try \"200k\" or \"6M\"".to_owned();
+    };
+    let rest = text.trim()[number.len()..].trim().to_ascii_lowercase();
+    let unit = match rest.chars().next() {
+        Some('k') => "k",
+        Some('g') => "G",
+        _ => "M",
+    };
+    format!("try \"{number}{unit}\"")
+}
+
+impl fmt::Display for BitRate {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        for (unit, suffix) in [(1_000_000_000, "G"), (1_000_000, "M"), (1_000, "k")] {
+            if self.0 >= unit && self.0.is_multiple_of(unit) {
+                return write!(f, "{}{suffix}", self.0 / unit);
+            }
+        }
+        write!(f, "{}", self.0)
+    }
 }
 
 impl fmt::Display for MilliCpu {
@@ -286,6 +334,7 @@ macro_rules! quantity_impls {
 
 quantity_impls!(MilliCpu, "cpu-quantity", "a quantity of cpu: cores (2, 0.5) or millicores (500m)");
 quantity_impls!(Bytes, "byte-quantity", "a quantity of bytes: 512, 64Ki, 256Mi, 4Gi, 10M");
+quantity_impls!(BitRate, "bit-rate", "a rate in bits a second: 9600, 200k, 6M, 1G");
 
 #[cfg(test)]
 mod tests {
@@ -327,6 +376,24 @@ mod tests {
             ("9007199254740993", 9_007_199_254_740_993),
         ] {
             assert_eq!(text.parse(), Ok(Bytes(bytes)), "{text}");
+        }
+    }
+
+    #[test]
+    fn rates_read_decimal_units_of_bits() {
+        for (text, bits) in
+            [("9600", 9_600), ("200k", 200_000), ("6M", 6_000_000), ("1.5G", 1_500_000_000)]
+        {
+            assert_eq!(text.parse(), Ok(BitRate(bits)), "{text}");
+            assert_eq!(BitRate(bits).to_string().parse(), Ok(BitRate(bits)), "{text}");
+        }
+        for (text, suggestion) in [
+            ("200Kb/s", "try \"200k\""),
+            ("6Mbps", "try \"6M\""),
+            ("fast", "try \"200k\" or \"6M\""),
+        ] {
+            let error = text.parse::<BitRate>().expect_err(text);
+            assert_eq!(error.suggestion(), suggestion, "{text}");
         }
     }
 

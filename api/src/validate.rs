@@ -12,7 +12,7 @@ use serde_json::Value;
 use crate::duration::Span;
 use crate::name::FunctionName;
 use crate::portion::Portion;
-use crate::quantity::{Bytes, MilliCpu};
+use crate::quantity::{BitRate, Bytes, MilliCpu};
 
 /// The class of a violation; the reason word of a `metav1.StatusCause`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -417,6 +417,12 @@ fn format_check(format: &str) -> Option<FormatCheck> {
         },
         "byte-quantity" => |value| {
             scalar_text(value)?.parse::<Bytes>().map(drop).map_err(|e| FormatProblem {
+                reason: e.to_string(),
+                suggestion: Some(e.suggestion().to_owned()),
+            })
+        },
+        "bit-rate" => |value| {
+            scalar_text(value)?.parse::<BitRate>().map(drop).map_err(|e| FormatProblem {
                 reason: e.to_string(),
                 suggestion: Some(e.suggestion().to_owned()),
             })

@@ -66,7 +66,7 @@ pub(crate) enum Command {
     Get(get::Args),
     /// Show everything about objects
     Describe(describe::Args),
-    /// Say where a task runs and why, or what keeps it from running; why a framework is not offered a node; what of a task set does not serve
+    /// Say where a task runs and why, or what keeps it from running; why a framework is not offered a node; what of a task set does not serve; why an application's parts are where they are
     Why(why::Args),
     /// Show what frameworks are offered now
     Offers(offers::Args),
@@ -197,6 +197,8 @@ mod tests {
             "muster why task/x",
             "muster why framework/x",
             "muster why taskset/x",
+            "muster why app/x",
+            "muster simulate offload --cases 10 --traces 0",
             "muster offers",
             "muster offers deliver -w -o json",
             "muster offers -A",

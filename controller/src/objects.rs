@@ -23,6 +23,8 @@ pub const TASKS: Resource = Resource::new("tasks");
 pub const TASK_SETS: Resource = Resource::new("tasksets");
 /// Templates that TaskSets have or had.
 pub const REVISIONS: Resource = Resource::new("tasksetrevisions");
+/// Applications.
+pub const APPLICATIONS: Resource = Resource::new("applications");
 /// Frameworks.
 pub const FRAMEWORKS: Resource = Resource::new("frameworks");
 /// Quotas.

@@ -1,6 +1,7 @@
 //! The resources. One file a kind: spec, status, rules. [`ALL`] is the one list of them, and
 //! [`admit`] the one gate that an object passes before it is stored, in the client and the server.
 
+pub mod application;
 pub mod config_map;
 pub mod event;
 pub mod framework;
@@ -73,6 +74,7 @@ pub static ALL: &[KindInfo] = &[
     task::INFO,
     taskset::INFO,
     taskset_revision::INFO,
+    application::INFO,
     lease::INFO,
     framework::INFO,
     quota::INFO,

@@ -8,7 +8,7 @@ use muster_agent::{Reexec, shim};
 use muster_controller::app;
 use tracing_subscriber::EnvFilter;
 
-use super::completion;
+use super::{completion, simulate};
 use crate::error::CliError;
 use crate::output::ui::Ui;
 
@@ -23,6 +23,9 @@ pub(crate) enum Command {
     Demo(crate::demo::Args),
     /// Run a program for robots: Avalon's workloads, and probes for tests
     Workload(muster_workloads::Args),
+    /// Run decisions over random worlds, with the code that decides in production
+    #[command(subcommand)]
+    Simulate(simulate::Command),
     /// Print a completion script for a shell
     Completion(completion::Args),
 }
@@ -37,6 +40,7 @@ pub(crate) fn run(command: Command, ui: &mut Ui) -> Result<ExitCode, CliError> {
         }
         Command::Demo(args) => crate::demo::run(&args, ui).map(ExitCode::from),
         Command::Workload(args) => Ok(muster_workloads::run(args).into()),
+        Command::Simulate(command) => simulate::run(&command, ui).map(ExitCode::from),
         Command::Completion(args) => completion::run(&args, ui).map(ExitCode::from),
     }
 }

@@ -20,6 +20,7 @@ pub(crate) mod plan;
 pub(crate) mod rollout;
 pub(crate) mod scale;
 pub(crate) mod settle;
+pub(crate) mod simulate;
 pub(crate) mod token;
 pub(crate) mod top;
 pub(crate) mod version;

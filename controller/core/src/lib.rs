@@ -28,6 +28,8 @@
 //! | [`recent`] | one allocation for what many nodes or tasks have in common |
 //! | [`node_health`] | when a node counts as lost |
 //! | [`taskset`] | which tasks of a TaskSet begin, end and follow each other |
+//! | [`offload`] | where the parts of an Application run, and why (AnyScale) |
+//! | [`simulation`] | nothing: it runs [`offload`] over random worlds, seeded |
 //! | [`stray`] | what an agent runs and should not |
 //! | [`ticket`] | who may exchange messages with an agent directly |
 //! | [`upkeep`] | when a node is out of service for its battery or for people's work |
@@ -45,6 +47,7 @@ pub mod hold;
 pub mod ledger;
 pub mod node_health;
 pub mod offer;
+pub mod offload;
 pub mod poses;
 pub mod preempt;
 pub mod quota;
@@ -53,6 +56,7 @@ pub mod recent;
 pub mod report;
 pub mod reschedule;
 pub mod schedule;
+pub mod simulation;
 pub mod space;
 pub mod stray;
 pub mod taskset;

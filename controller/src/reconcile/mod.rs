@@ -15,12 +15,14 @@
 //! | [`quotas`] | the scheduler's ledger | writes what namespaces have into Quota status |
 //! | [`health`] | heartbeats | marks silent nodes and their tasks |
 //! | [`taskset`] | TaskSets, their tasks, nodes | begins and ends tasks, changes them, goes back |
+//! | [`application`] | Applications, Nodes | writes which parts may move, and where; nothing moves them yet |
 //! | [`upkeep`] | Nodes with batteries and maintenance windows | says when nothing new begins there, ends what is to be gone |
 //! | [`orders`] | Nodes | tells their agents of emergency stops |
 //! | [`deletion`] | Tasks being deleted | removes those whose processes are gone |
 //! | [`garbage`] | ownerReferences | deletes what lost its owner |
 //! | [`history`] | Events, the store's history | forgets what is old |
 
+pub mod application;
 mod bind;
 pub mod books;
 pub mod checkpoints;
@@ -95,6 +97,7 @@ pub fn spawn(
     run("deletion", Box::pin(deletion::run(Arc::clone(context))));
     run("garbage", Box::pin(garbage::run(Arc::clone(context))));
     run("taskset", Box::pin(taskset::run(Arc::clone(context))));
+    run("application", Box::pin(application::run(Arc::clone(context))));
     run("upkeep", Box::pin(upkeep::run(Arc::clone(context))));
     run("orders", Box::pin(orders::run(Arc::clone(context), Arc::clone(sessions))));
     run("history", Box::pin(history::run(Arc::clone(context))));

@@ -4,6 +4,7 @@ use std::sync::Arc;
 
 use http::{HeaderValue, StatusCode};
 use muster_api::kind;
+use muster_api::kind::application::Application;
 use muster_api::kind::namespace::Namespace;
 use muster_api::kind::node::Node;
 use muster_api::kind::task::Task;
@@ -148,6 +149,7 @@ fn next(
 fn check_status(entry: &Entry, name: &str, object: &Value) -> Result<(), Failure> {
     let read = match entry.info.kind {
         "Task" => Task::deserialize(object).map(drop),
+        "Application" => Application::deserialize(object).map(drop),
         "TaskSet" => TaskSet::deserialize(object).map(drop),
         "Node" => Node::deserialize(object).map(drop),
         "Namespace" => Namespace::deserialize(object).map(drop),

@@ -2,6 +2,7 @@
 //! say than its fields.
 
 mod any;
+mod application;
 mod framework;
 mod keyed;
 mod lease;
@@ -101,6 +102,9 @@ async fn describe(
         "Quota" => {
             let quota: Quota = serde_json::from_value(object).map_err(read)?;
             quota::describe(&mut sheet, &quota, now);
+        }
+        "Application" => {
+            application::describe(&mut sheet, &serde_json::from_value(object).map_err(read)?, now);
         }
         "TaskSet" => {
             let set = serde_json::from_value(object).map_err(read)?;

@@ -1,6 +1,7 @@
 //! `muster why`: where a task runs and why there, how it ended, or, per node, what refuses it; why nodes are not
-//! offered to a framework; and what of a TaskSet does not serve.
+//! offered to a framework; what of a TaskSet does not serve; and why an Application's parts are where they are.
 
+mod application;
 mod framework;
 mod task;
 mod taskset;
@@ -23,7 +24,7 @@ use crate::target::{self, Named};
 /// `muster why`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
-    /// The task, NAME or task/NAME; or framework/NAME, or taskset/NAME
+    /// The task, NAME or task/NAME; or framework/NAME, taskset/NAME, application/NAME
     object: String,
     /// Print what the controller says, for programs
     #[arg(short, long, value_enum, value_name = "FORMAT")]
@@ -55,7 +56,7 @@ impl Asked<'_> {
 }
 
 pub(crate) async fn run(args: Args, session: &mut Session) -> Outcome {
-    let named = target::one_of(&args.object, &["task", "framework", "taskset"])?;
+    let named = target::one_of(&args.object, &["task", "framework", "taskset", "application"])?;
     let asked = ask(&named, session).await?;
     let of_set = match named.info.kind {
         "TaskSet" => tasks_of(asked.name, session).await?,
@@ -68,6 +69,7 @@ pub(crate) async fn run(args: Args, session: &mut Session) -> Outcome {
     };
     let (text, value) = match named.info.kind {
         "TaskSet" => taskset::told(&asked, &of_set, &session.ui.styles).map_err(read)?,
+        "Application" => application::told(&asked, &session.ui.styles).map_err(read)?,
         "Framework" => framework::told(&asked, &session.ui.styles).map_err(read)?,
         _ => task::told(&asked, &session.ui.styles).map_err(read)?,
     };

@@ -1,5 +1,6 @@
 //! The columns of each kind: one file a kind. A kind without a file gets NAME and AGE.
 
+pub(crate) mod application;
 pub(crate) mod event;
 pub(crate) mod framework;
 mod keyed;
@@ -14,6 +15,7 @@ mod taskset_revision;
 use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 use muster_api::kind::KindInfo;
+use muster_api::kind::application::Application;
 use muster_api::kind::config_map::ConfigMap;
 use muster_api::kind::event::Event;
 use muster_api::kind::framework::Framework;
@@ -69,6 +71,7 @@ pub(crate) fn table(info: &KindInfo, objects: &[Value], layout: Layout) -> Table
         "Node" => typed::<Node>(node::COLUMNS, info, objects, layout),
         "Task" => typed::<Task>(task::COLUMNS, info, objects, layout),
         "TaskSet" => typed::<TaskSet>(taskset::COLUMNS, info, objects, layout),
+        "Application" => typed::<Application>(application::COLUMNS, info, objects, layout),
         "TaskSetRevision" => {
             typed::<TaskSetRevision>(taskset_revision::COLUMNS, info, objects, layout)
         }

@@ -1,0 +1,76 @@
+//! Applications: whose they are, and what of them may move.
+
+use muster_api::condition::MANAGED;
+use muster_api::kind::application::pin::pins;
+use muster_api::kind::application::{Application, Policy};
+
+use super::{Column, age};
+use crate::output::style::Mood;
+use crate::output::table::Cell;
+
+pub(super) const COLUMNS: &[Column<Application>] = &[
+    Column::new("HOME", |app, _| app.spec.home.as_str().into()),
+    Column::new("PARTS", |app, _| app.spec.parts.len().to_string().into()),
+    Column::new("MIGRATABLE", |app, _| migratable(app).into()),
+    Column::new("AWAY", |app, _| away(app)),
+    Column::new("POLICY", |app, _| policy(app.spec.policy).into()),
+    Column::new("MANAGED", |app, _| managed(app)),
+    Column::new("AGE", |app, now| age(app.metadata.creation_timestamp.as_ref(), now)),
+    Column::wide("SCALES", |app, _| {
+        app.status.as_ref().map(|s| s.scales.join(",")).unwrap_or_default().into()
+    }),
+];
+
+fn migratable(app: &Application) -> String {
+    let parts = app.spec.parts.iter().filter(|part| pins(&app.spec, part).is_empty());
+    parts.map(|part| part.name.as_str()).collect::<Vec<_>>().join(",")
+}
+
+/// How many parts are not at home; nothing before any was placed.
+fn away(app: &Application) -> Cell {
+    let parts = app.status.iter().flat_map(|s| &s.parts);
+    let placed: Vec<&String> = parts.filter_map(|p| p.scale.as_ref()).collect();
+    if placed.is_empty() {
+        return Cell::from("");
+    }
+    placed.iter().filter(|scale| ***scale != app.spec.home).count().to_string().into()
+}
+
+pub(crate) fn policy(policy: Policy) -> &'static str {
+    match policy {
+        Policy::Optimal => "Optimal",
+        Policy::Greedy => "Greedy",
+        Policy::Home => "Home",
+    }
+}
+
+fn managed(app: &Application) -> Cell {
+    let condition = app.status.as_ref().and_then(|s| s.condition(MANAGED));
+    condition.map_or_else(|| Cell::from(""), |c| Cell::new(format!("{:?}", c.status), Mood::Plain))
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use crate::output::columns::{Layout, table};
+    use crate::output::style::Styles;
+
+    #[test]
+    fn a_row_says_what_may_move() {
+        let info = muster_api::kind::find_by_word("app").expect("served");
+        let now = jiff::Timestamp::UNIX_EPOCH;
+        let layout = Layout { wide: false, namespaces: false, kinds: false, now };
+        let part = |name: &str, sensors: serde_json::Value| json!({"name": name, "template": {"spec": {"resources": {"sensors": sensors}}}});
+        let object = json!({
+            "apiVersion": "muster.dev/v1alpha1", "kind": "Application", "metadata": {"name": "corridor"},
+            "spec": {"home": "youbot", "parts": [part("camera", json!(["x:Y"])), part("amcl", json!([]))]},
+            "status": {"conditions": [{"type": "Managed", "status": "False"}]},
+        });
+        assert_eq!(
+            table(info, &[object], layout).text(&Styles::default()),
+            "NAME       HOME     PARTS   MIGRATABLE   AWAY   POLICY    MANAGED   AGE\n\
+             corridor   youbot   2       amcl         -      Optimal   False     -\n"
+        );
+    }
+}
