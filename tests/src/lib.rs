@@ -6,6 +6,7 @@
 //! | [`cluster`] | starting, killing and restarting the daemons; the API of the cluster |
 //! | [`wait`] | waiting for what a watch or the kernel shows, with a generous deadline |
 //! | [`puppet`] | frameworks on the Python SDK, one process each |
+//! | [`ros`] | a real ROS 1: a roscore of its own, and programs that talk to it |
 //! | [`docker`] | an image without a registry |
 //! | [`kernel`] | what the kernel says: processes, start times, cgroups |
 //!
@@ -15,7 +16,9 @@ pub mod cluster;
 pub mod docker;
 pub mod kernel;
 pub mod puppet;
+pub mod ros;
 pub mod wait;
 
 pub use cluster::{AgentOptions, Cluster};
 pub use puppet::Puppet;
+pub use ros::Ros;
