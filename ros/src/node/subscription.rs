@@ -39,13 +39,11 @@ pub struct SubscribeOptions {
     pub queue: usize,
     /// The largest message that is taken, bytes: a publisher that announces more is left alone.
     pub largest: usize,
-    /// Only count, over this window.
-    pub(super) count: Option<Duration>,
 }
 
 impl Default for SubscribeOptions {
     fn default() -> Self {
-        SubscribeOptions { queue: 10, largest: LARGEST_FRAME, count: None }
+        SubscribeOptions { queue: 10, largest: LARGEST_FRAME }
     }
 }
 
@@ -89,6 +87,8 @@ pub struct Subscription {
     kind: &'static str,
     md5: &'static str,
     options: SubscribeOptions,
+    /// Messages are counted only, over this window.
+    count: Option<Duration>,
     queue: Queue<Incoming>,
     meter: Mutex<RateMeter>,
     began: Instant,
@@ -106,14 +106,16 @@ impl Subscription {
         topic: String,
         (kind, md5): (&'static str, &'static str),
         options: SubscribeOptions,
+        count: Option<Duration>,
     ) -> Arc<Subscription> {
         let subscription = Arc::new(Subscription {
             topic,
             kind,
             md5,
             queue: Queue::new(options.queue),
-            meter: Mutex::new(RateMeter::new(options.count.unwrap_or(Duration::from_secs(1)))),
+            meter: Mutex::new(RateMeter::new(count.unwrap_or(Duration::from_secs(1)))),
             options,
+            count,
             began: Instant::now(),
             publishers: watch::Sender::new(BTreeSet::new()),
             peers: watch::Sender::new(BTreeMap::new()),
@@ -253,7 +255,7 @@ async fn link(
     connection.set_connected(true);
     subscription.say(uri, Ok(()));
     loop {
-        let size = if subscription.options.count.is_some() {
+        let size = if subscription.count.is_some() {
             skip_frame(&mut stream, subscription.options.largest).await?
         } else {
             let body = read_frame(&mut stream, subscription.options.largest).await?;
