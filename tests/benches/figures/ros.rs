@@ -48,7 +48,8 @@ fn since(stamp_us: u64) -> Duration {
 }
 
 async fn subscribe(node: &Node, until: Instant) -> Samples {
-    let mut topic = node.subscribe::<Odometry>("/odom", SubscribeOptions::default()).expect("a topic");
+    let mut topic =
+        node.subscribe::<Odometry>("/odom", SubscribeOptions::default()).expect("a topic");
     let mut samples = Samples::default();
     while let Ok(next) = tokio::time::timeout_at(until.into(), topic.next()).await {
         let (odometry, _) = next.expect("an Odometry");
@@ -66,7 +67,8 @@ async fn watch(client: Client, until: Instant) -> Samples {
     while let Ok(line) = tokio::time::timeout_at(until.into(), lines.next()).await {
         let line = line.expect("the watch goes on").expect("readable");
         let event: Value = serde_json::from_str(&line).expect("a JSON line");
-        let stamp = event["object"]["stamp"].as_str().and_then(|s| s.parse::<jiff::Timestamp>().ok());
+        let stamp =
+            event["object"]["stamp"].as_str().and_then(|s| s.parse::<jiff::Timestamp>().ok());
         if let Some(stamp) = stamp.and_then(|s| u64::try_from(s.as_microsecond()).ok()) {
             samples.push(since(stamp));
         }

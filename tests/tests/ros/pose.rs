@@ -115,7 +115,17 @@ async fn a_master_that_is_started_anew_is_found_again() {
     // Data does not pass the master: what is connected stays so, and the robot is localized.
     ros.kill_core();
     follows(&cluster, (0.0, 0.0, 0.0)).await;
+    // rospy does not register again; the new master knows nothing of the driver, which drives on all the same.
+    ros.start_core().await;
+    let known = async || ros.output("rosnode", &["list"]).await.contains("/muster_agent_rover_1");
+    wait::until("registered again", || async {
+        known().await.then_some(()).ok_or_else(String::new)
+    })
+    .await;
+    follows(&cluster, (0.0, 0.0, 0.0)).await;
     driver.kill().await;
+    condition(&cluster, POSE_FRESH, ConditionStatus::False, "NoPublisher").await;
+    ros.kill_core();
     let why = condition(&cluster, POSE_FRESH, ConditionStatus::False, "NoMaster").await;
     assert!(why.contains("failed to connect"), "{why}");
     ros.start_core().await;
