@@ -169,7 +169,7 @@ impl Tracker {
 
     /// A message with a pose came.
     pub fn say(&mut self, kind: Kind, said: &Said, now: &Clocks) {
-        let place = self.from_frame(kind, &said.frame).and_then(|map_from_frame| {
+        let place = self.map_from(kind, &said.frame).and_then(|map_from_frame| {
             let pose = map_from_frame * said.pose.ok_or(NoPlace::Numbers)?;
             let covariance = frame::covariance(&said.covariance, &map_from_frame);
             Ok(Place {
@@ -184,8 +184,8 @@ impl Tracker {
         self.set(place);
     }
 
-    /// From the frame of a message to the map's.
-    fn from_frame(&self, kind: Kind, frame: &str) -> Result<Transform, NoPlace> {
+    /// The map's frame from that of a message.
+    fn map_from(&self, kind: Kind, frame: &str) -> Result<Transform, NoPlace> {
         let (frame, map, odom) = (plain(frame), plain(&self.frames.map), plain(&self.frames.odom));
         let correction = self.map_from_odom.unwrap_or_else(Transform::identity);
         match kind {
@@ -213,8 +213,10 @@ impl Tracker {
         let before = self.place.as_ref().and_then(|place| place.stamp);
         let place = self.look_up(now);
         // Wheels and cameras move without telling more of the robot's place: that is as old as it was.
-        let news =
-            place.as_ref().map_or(true, |place| place.stamp.is_none() || place.stamp != before);
+        let news = match &place {
+            Ok(place) => place.stamp.is_none() || place.stamp != before,
+            Err(_) => true,
+        };
         if news {
             self.set(place);
         } else if let (Some(old), Ok(new)) = (&mut self.place, place) {
