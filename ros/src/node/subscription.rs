@@ -216,7 +216,7 @@ impl Subscription {
         let (peers, publishers) = (self.peers.borrow(), self.publishers.borrow().all());
         // What a task said just before it was ended may still stand there.
         let of_now =
-            || peers.iter().filter(|(uri, _)| publishers.contains(uri)).map(|(_, how)| how);
+            || peers.iter().filter(|(uri, _)| publishers.contains(*uri)).map(|(_, how)| how);
         SubscriptionStatus {
             publishers: publishers.len(),
             connected: of_now().filter(|how| how.is_ok()).count(),
