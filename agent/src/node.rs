@@ -6,7 +6,8 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use muster_api::condition::{
-    ACTUATORS_FENCED, Condition, DISK_PRESSURE, EMERGENCY_STOP, LOCALIZED, QUOTAS_ENFORCED,
+    ACTUATORS_FENCED, Condition, DISK_PRESSURE, EMERGENCY_STOP, LOCALIZED, POSE_FRESH,
+    QUOTAS_ENFORCED,
 };
 use muster_api::kind::node::RuntimeStatus;
 use muster_api::kind::node::estop::EStopStatus;
@@ -78,7 +79,10 @@ impl Node {
             estop: None,
         };
         let position = match facts.kind {
-            Kind::Robot => config.position.as_ref().map(|source| source.open(&config.map)),
+            Kind::Robot => config
+                .position
+                .as_ref()
+                .map(|source| source.open(&config.map, shared.node.as_str(), &config.pose)),
             Kind::Cloud => None,
         };
         let battery = match facts.kind {
@@ -131,13 +135,13 @@ impl Node {
             None => Condition::new(DISK_PRESSURE, false, "EnoughSpace", String::new()),
         });
         if let Some(position) = &self.position {
-            let pose = position.current();
-            let (localized, reason) = match pose.map(|pose| pose.localized) {
-                Some(true) => (true, "Localized"),
-                Some(false) => (false, "Lost"),
-                None => (false, "NoPose"),
-            };
-            conditions.push(Condition::new(LOCALIZED, localized, reason, String::new()));
+            let seen = position.seen();
+            let verdicts = [(POSE_FRESH, seen.fresh), (LOCALIZED, Some(seen.localized))];
+            for (condition, verdict) in verdicts {
+                conditions.extend(
+                    verdict.map(|v| Condition::new(condition, v.holds, v.reason, v.message)),
+                );
+            }
         }
         let battery = self.battery.as_ref().and_then(BatteryGauge::charge);
         let mission_locks =

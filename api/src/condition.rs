@@ -73,6 +73,8 @@ pub const DISK_PRESSURE: &str = "DiskPressure";
 pub const ACTUATORS_FENCED: &str = "ActuatorsFenced";
 /// An emergency stop is in force on the robot.
 pub const EMERGENCY_STOP: &str = "EmergencyStop";
+/// What the robot's pose is read from says something new in time.
+pub const POSE_FRESH: &str = "PoseFresh";
 /// The robot knows where it is.
 pub const LOCALIZED: &str = "Localized";
 /// Quotas of tasks are enforced by the kernel on this node (invariant 7).

@@ -7,6 +7,7 @@
 //! | [`wait`] | waiting for what a watch or the kernel shows, with a generous deadline |
 //! | [`puppet`] | frameworks on the Python SDK, one process each |
 //! | [`echo`] | a framework on the Rust SDK, with an executor that sends messages back |
+//! | [`ros`] | a real ROS 1: a roscore of its own, and programs that talk to it |
 //! | [`docker`] | an image without a registry |
 //! | [`kernel`] | what the kernel says: processes, start times, cgroups |
 //!
@@ -17,8 +18,10 @@ pub mod docker;
 pub mod echo;
 pub mod kernel;
 pub mod puppet;
+pub mod ros;
 pub mod wait;
 
 pub use cluster::{AgentOptions, Cluster};
 pub use echo::Echo;
 pub use puppet::Puppet;
+pub use ros::Ros;

@@ -13,6 +13,7 @@
 //! | [`report`] | what is told to the controller, and its sequence |
 //! | [`executor`] | an executor and the works it was given: who may end, and on whose word |
 //! | [`gate`] | who may command the robot's actuators, and when the robot is stopped |
+//! | [`pose`] | where the robot is by what ROS says: frames, transforms, whether it counts |
 //! | [`plan`] | a set of assignments against the tasks that are known: who gets which event |
 //!
 //! The executor (`muster-agent`'s `driver`) keeps three promises that the proofs here rest on:
@@ -27,6 +28,7 @@ pub mod executor;
 pub mod gate;
 pub mod observed;
 pub mod plan;
+pub mod pose;
 pub mod probe;
 pub mod report;
 pub mod restart;

@@ -10,6 +10,7 @@ mod list;
 mod messages;
 mod placement;
 mod poses;
+mod ros;
 mod stats;
 mod stops;
 mod submit;
@@ -46,6 +47,11 @@ const FIGURES: &[Figure] = &[
     ("stops", "from what should stop a robot until its driver reads the stop", || {
         Box::pin(stops::all())
     }),
+    (
+        "pose",
+        "a robot's pose from rospy's publish to the controller, against a bare subscriber",
+        || Box::pin(ros::pose()),
+    ),
     ("footprint", "RSS and idle CPU of agent and controller", || Box::pin(footprint::all())),
 ];
 
