@@ -34,8 +34,6 @@ struct Inner {
     compacted: u64,
     held: Vec<String>,
     refused: Vec<(String, String, String)>,
-    /// The same, once nobody rehearses any more.
-    refused_late: Vec<(String, String, String)>,
     answers: BTreeMap<String, String>,
     requests: Vec<String>,
     last_body: Value,
@@ -191,11 +189,6 @@ impl Fake {
         self.lock().refused.push((name.to_owned(), field.to_owned(), message.to_owned()));
     }
 
-    /// The same, but for dry runs: somebody else was faster.
-    pub(crate) fn refuse_late(&self, name: &str, field: &str, message: &str) {
-        self.lock().refused_late.push((name.to_owned(), field.to_owned(), message.to_owned()));
-    }
-
     /// Answers `METHOD PATH`.
     pub(crate) fn answer(&self, request: &str, answer: Value) {
         self.answer_text(request, &answer.to_string());
@@ -334,10 +327,9 @@ async fn handle(State(fake): State<Fake>, method: Method, uri: Uri, body: Bytes)
     }
 }
 
-fn refusal(fake: &Fake, name: &str, dry: bool) -> Option<Response> {
+fn refusal(fake: &Fake, name: &str) -> Option<Response> {
     let inner = fake.lock();
-    let late = inner.refused_late.iter().filter(|_| !dry);
-    let (_, field, message) = inner.refused.iter().chain(late).find(|(n, _, _)| n == name)?;
+    let (_, field, message) = inner.refused.iter().find(|(n, _, _)| n == name)?;
     let details = json!({"causes": [{"field": field, "message": message}]});
     Some(failure(StatusCode::UNPROCESSABLE_ENTITY, "Invalid", "is invalid", details))
 }
@@ -345,7 +337,7 @@ fn refusal(fake: &Fake, name: &str, dry: bool) -> Option<Response> {
 fn create(fake: &Fake, path: &Path, mut object: Value, dry: bool) -> Response {
     let name = object["metadata"]["name"].as_str().unwrap_or_default().to_owned();
     let key = path.key(&name);
-    if let Some(refused) = refusal(fake, &name, dry) {
+    if let Some(refused) = refusal(fake, &name) {
         return refused;
     }
     if fake.object(&key).is_some() {
@@ -372,7 +364,7 @@ fn create(fake: &Fake, path: &Path, mut object: Value, dry: bool) -> Response {
 
 fn patch(fake: &Fake, key: &str, mut object: Value, patch: &Value, dry: bool) -> Response {
     let name = object["metadata"]["name"].as_str().unwrap_or_default().to_owned();
-    if let Some(refused) = refusal(fake, &name, dry) {
+    if let Some(refused) = refusal(fake, &name) {
         return refused;
     }
     json_patch::merge(&mut object, patch);
