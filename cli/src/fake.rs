@@ -34,6 +34,8 @@ struct Inner {
     compacted: u64,
     held: Vec<String>,
     refused: Vec<(String, String, String)>,
+    /// The same, once nobody rehearses any more.
+    refused_late: Vec<(String, String, String)>,
     answers: BTreeMap<String, String>,
     requests: Vec<String>,
     last_body: Value,
@@ -189,6 +191,11 @@ impl Fake {
         self.lock().refused.push((name.to_owned(), field.to_owned(), message.to_owned()));
     }
 
+    /// The same, but for dry runs: somebody else was faster.
+    pub(crate) fn refuse_late(&self, name: &str, field: &str, message: &str) {
+        self.lock().refused_late.push((name.to_owned(), field.to_owned(), message.to_owned()));
+    }
+
     /// Answers `METHOD PATH`.
     pub(crate) fn answer(&self, request: &str, answer: Value) {
         self.answer_text(request, &answer.to_string());
@@ -327,9 +334,10 @@ async fn handle(State(fake): State<Fake>, method: Method, uri: Uri, body: Bytes)
     }
 }
 
-fn refusal(fake: &Fake, name: &str) -> Option<Response> {
+fn refusal(fake: &Fake, name: &str, dry: bool) -> Option<Response> {
     let inner = fake.lock();
-    let (_, field, message) = inner.refused.iter().find(|(n, _, _)| n == name)?;
+    let late = inner.refused_late.iter().filter(|_| !dry);
+    let (_, field, message) = inner.refused.iter().chain(late).find(|(n, _, _)| n == name)?;
     let details = json!({"causes": [{"field": field, "message": message}]});
     Some(failure(StatusCode::UNPROCESSABLE_ENTITY, "Invalid", "is invalid", details))
 }
@@ -337,7 +345,7 @@ fn refusal(fake: &Fake, name: &str) -> Option<Response> {
 fn create(fake: &Fake, path: &Path, mut object: Value, dry: bool) -> Response {
     let name = object["metadata"]["name"].as_str().unwrap_or_default().to_owned();
     let key = path.key(&name);
-    if let Some(refused) = refusal(fake, &name) {
+    if let Some(refused) = refusal(fake, &name, dry) {
         return refused;
     }
     if fake.object(&key).is_some() {
@@ -364,7 +372,7 @@ fn create(fake: &Fake, path: &Path, mut object: Value, dry: bool) -> Response {
 
 fn patch(fake: &Fake, key: &str, mut object: Value, patch: &Value, dry: bool) -> Response {
     let name = object["metadata"]["name"].as_str().unwrap_or_default().to_owned();
-    if let Some(refused) = refusal(fake, &name) {
+    if let Some(refused) = refusal(fake, &name, dry) {
         return refused;
     }
     json_patch::merge(&mut object, patch);

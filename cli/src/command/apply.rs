@@ -321,13 +321,17 @@ async fn store(
     }
     if !left.is_empty() && !applied.is_empty() && mode == Mode::Store {
         let stored: Vec<String> = applied.iter().map(|(m, _)| m.title()).collect();
-        let (stored, left) = (stored.join(", "), left.join(", "));
-        session.ui.note(&format!("stored: {stored}; not stored: {left}"));
+        session.ui.note(&half_way(&stored, &left));
     }
     if let Some(format) = output {
         print(&mut session.ui, &applied, single, format)?;
     }
     Ok((applied, errors.exit()))
+}
+
+/// What there is now of objects that were checked together, when somebody else came in between.
+fn half_way(stored: &[String], left: &[String]) -> String {
+    format!("stored: {}; not stored: {}", stored.join(", "), left.join(", "))
 }
 
 fn refuse(
@@ -527,6 +531,25 @@ spec:
         fake.answer(check, json!({"refusals": []}));
         let stored = "task/two created\ntask/one created\n";
         assert_eq!(fake.run(&["apply", "-f", &path]).await, (exit::OK, stored.to_owned()));
+    }
+
+    #[tokio::test]
+    async fn who_is_refused_in_the_middle_hears_what_was_stored() {
+        let dir = tempfile::tempdir().expect("a directory");
+        let fake = Fake::new();
+        fake.refuse_late("two", "spec.resources.cpu", "asks for more than is left");
+        let path = file(
+            &dir,
+            &format!("{}---\n{}", TASK.replace("NAME", "one"), TASK.replace("NAME", "two")),
+        );
+        let (code, out) = fake.run(&["apply", "-f", &path]).await;
+        assert_eq!((code, out.as_str()), (exit::INVALID, "task/one created\n"));
+        assert!(fake.object("tasks/default/one").is_some());
+        let titles = |names: &[&str]| names.iter().map(|n| format!("task/{n}")).collect::<Vec<_>>();
+        assert_eq!(
+            super::half_way(&titles(&["one"]), &titles(&["two", "three"])),
+            "stored: task/one; not stored: task/two, task/three"
+        );
     }
 
     #[tokio::test]

@@ -122,6 +122,37 @@ async fn a_controller_that_is_not_there_is_said_with_the_next_step() {
     assert!(err.contains("https://127.0.0.1:") && err.contains("kubeconfig"), "{err}");
 }
 
+/// What a quota lets in one by one and not together is refused whole, at its place.
+#[tokio::test(flavor = "multi_thread")]
+async fn manifests_that_exceed_a_quota_together_store_nothing() {
+    let cluster = Cluster::start().await;
+    let quota = json!({
+        "apiVersion": muster_api::API_VERSION, "kind": "Quota", "metadata": {"name": "default"},
+        "spec": {"hard": {"cpu": "1"}},
+    });
+    cluster.post("/apis/muster.dev/v1alpha1/namespaces/default/quotas", &quota).await;
+    let task = |name: &str, cpu: &str| {
+        format!(
+            "apiVersion: muster.dev/v1alpha1\nkind: Task\nmetadata: {{name: {name}}}\nspec:\n  \
+             resources:\n    cpu: {cpu}\n  run: {{process: {{command: [sleep, '1000']}}}}\n"
+        )
+    };
+    let manifest = cluster.dir().join("three.yaml");
+    let text = [task("a", "400m"), task("b", "500m"), task("c", "300m")].join("---\n");
+    std::fs::write(&manifest, text).expect("writable");
+    let file = manifest.to_str().expect("text");
+    for verb in ["apply", "plan"] {
+        let (code, _, err) = muster(&cluster, &[verb, "-f", file]);
+        assert_eq!(code, 5, "{err}");
+        let place = format!("{file}:22:5: spec.resources.cpu: asks for 300m cpu");
+        assert!(err.contains(&place) && err.contains("alone it would pass"), "{err}");
+        assert_eq!(muster(&cluster, &["get", "tasks", "-o", "name"]).1, "");
+    }
+    let text = [task("a", "400m"), task("b", "500m"), task("c", "100m")].join("---\n");
+    std::fs::write(&manifest, text).expect("writable");
+    assert_eq!(muster(&cluster, &["apply", "-f", file]).0, 0);
+}
+
 /// What a namespace has stands beside what it may have, for declared tasks as they come and go.
 #[tokio::test(flavor = "multi_thread")]
 async fn a_quota_says_what_is_used() {

@@ -87,6 +87,12 @@ async fn figure_4_of_avalon_with_frameworks() {
         two.launch(&[("slave-1", "second-driver", spec(None, &[], &["arm:Grasp"]))]).await;
     assert_eq!(refused["reason"], "CONFLICT", "{refused}");
 
+    // A framework decides itself where a task is tried again.
+    let mut again = spec(None, &[], &[]);
+    again["reschedule"] = json!({});
+    let refused = two.launch(&[("slave-1", "again", again)]).await;
+    assert_eq!(refused["reason"], "INVALID", "{refused}");
+
     // 7: its two tasks, which need SR, are deployed beside the first ones.
     two.holds("both again", |o| o.len() == 2).await;
     let launched = two
