@@ -11,6 +11,7 @@
 //! launch begins, and a number is used again only when a runtime has said that nothing of it was
 //! ever started.
 
+mod failed;
 mod probed;
 mod waited;
 
@@ -511,37 +512,6 @@ impl Workload {
             self.state = State::Waiting { until: context.now.boot };
             self.move_on(context, effects);
         }
-    }
-
-    fn on_failure(&mut self, failure: &Failure, context: Context, effects: &mut Vec<Effect>) {
-        let reason = Reason::Runtime(failure.reason.clone());
-        self.unused = true;
-        if self.forgotten || self.desired.stop.is_some() {
-            return self.ended_unstarted(context, effects);
-        }
-        self.failed = self.failed.saturating_add(1);
-        if failure.retry && !self.is_given_up() {
-            self.failures = self.failures.saturating_add(1);
-            self.wait(reason, &failure.message, context, effects);
-        } else {
-            self.ended_unable(reason, &failure.message, context);
-        }
-    }
-
-    /// As many attempts have failed here as may.
-    fn is_given_up(&self) -> bool {
-        self.desired.attempts.is_some_and(|attempts| self.failed >= attempts)
-    }
-
-    /// The end of a task that could not be started.
-    fn ended_unable(&mut self, reason: Reason, message: &str, context: Context) {
-        self.state = State::Ended;
-        let mut content = self.report_draft();
-        content.phase = Phase::Failed;
-        content.finished_at = Some(context.now.wall);
-        content.reason = reason;
-        message.clone_into(&mut content.message);
-        self.report.update(content);
     }
 
     fn on_exit(&mut self, exit: &Exit, context: Context, effects: &mut Vec<Effect>) {

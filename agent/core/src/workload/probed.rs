@@ -4,7 +4,7 @@ use serde::{Deserialize, Serialize};
 
 use super::{Content, Context, Effect, Reason, State, Workload};
 use crate::desired::RestartPolicy;
-use crate::observed::{End, Exit, Loss};
+use crate::observed::Exit;
 use crate::probe::{Role, Verdict};
 use crate::restart;
 
@@ -97,25 +97,6 @@ impl Workload {
         };
         let may = self.desired.stop.is_none() && !self.forgotten;
         may && !(self.has_failed(exit) && self.is_given_up()) && restart::restarts(policy, exit)
-    }
-
-    /// Counts the attempt that ended, if it failed by its own doing.
-    pub(super) fn count_failure(&mut self, exit: &Exit) {
-        if self.has_failed(exit) {
-            self.failed = self.failed.saturating_add(1);
-        }
-    }
-
-    /// Whether an attempt failed: not one that was ended by order, for another task, or by a reboot.
-    fn has_failed(&self, exit: &Exit) -> bool {
-        if self.desired.stop.is_some() || exit.end == End::Lost(Loss::Reboot) {
-            return false;
-        }
-        match &self.condemned {
-            Some(Condemned::Dependency { .. }) => false,
-            Some(Condemned::Probe { .. }) => true,
-            None => !exit.succeeded(),
-        }
     }
 }
 
