@@ -125,7 +125,7 @@ fn algorithm_1_takes_the_hungriest_part_to_the_strongest_scale() {
     assert_eq!(greedy::settle(&problem), [0, 2, 1]);
     assert_eq!(greedy::step(&problem, &[0, 2, 0], |item| item != 2), Some((0, 1)));
     // The one that moved last comes home first.
-    let mut narrow = problem.clone();
+    let mut narrow = problem;
     narrow.scales[0].bandwidth = 5.0;
     assert_eq!(greedy::bring_home(&narrow, &[0, 2, 1], &[1, 2]), [0, 2, 0]);
 }
