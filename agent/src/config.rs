@@ -17,6 +17,7 @@ use crate::declared::Declared;
 use crate::durable::{self, FileError, Keep};
 use crate::gauge::battery::BatterySource;
 use crate::position::PositionSource;
+use crate::position::settings::{PoseArgs, PoseSettings};
 use crate::runtime::process::attempt::LogBounds;
 
 /// Where the Docker Engine listens when nobody says otherwise.
@@ -75,10 +76,12 @@ pub struct Args {
     /// The map that positions are in [default: as given last, else map]
     #[arg(long, value_name = "NAME")]
     pub map: Option<String>,
-    /// Where the robot is: `static:X,Y[,YAW]`, or `file:PATH` with a line `X Y [YAW]` that the robot keeps up to date
-    /// [default: as given last]
+    /// Where the robot is: `static:X,Y[,YAW]`, `file:PATH` with a line `X Y [YAW]` that the robot keeps up to date,
+    /// or `ros1:TOPIC` of type Odometry, PoseWithCovarianceStamped, PoseStamped or TFMessage [default: as given last]
     #[arg(long, value_name = "SOURCE", allow_hyphen_values = true)]
     pub position: Option<String>,
+    #[command(flatten)]
+    pub(crate) pose: PoseArgs,
     /// Offer at most this much cpu [default: as given last, else all]
     #[arg(long, value_name = "CPU")]
     pub cpu: Option<String>,
@@ -120,6 +123,7 @@ struct FileConfig {
     ar_res: Option<String>,
     map: Option<String>,
     position: Option<String>,
+    pose: PoseArgs,
     cpu: Option<String>,
     memory: Option<String>,
     speed: Option<f64>,
@@ -142,6 +146,7 @@ pub struct Config {
     pub(crate) sensors: BTreeSet<FunctionName>,
     pub(crate) actuators: BTreeSet<FunctionName>,
     pub(crate) position: Option<PositionSource>,
+    pub(crate) pose: PoseSettings,
     pub(crate) map: String,
     pub(crate) cpu: Option<MilliCpu>,
     pub(crate) memory: Option<Bytes>,
@@ -206,12 +211,15 @@ impl Args {
             None => FileConfig::default(),
         };
         let data_dir = absolute(self.data_dir.or(file.data_dir).unwrap_or_else(default_data_dir));
+        let mut pose = self.pose;
+        pose.fill(file.pose);
         let mut declared = Declared {
             labels: labels(file.labels, &self.labels)?,
             sr_res: self.sr_res.or(file.sr_res),
             ar_res: self.ar_res.or(file.ar_res),
             map: self.map.or(file.map),
             position: self.position.or(file.position),
+            pose,
             cpu: self.cpu.or(file.cpu),
             memory: self.memory.or(file.memory),
             speed: self.speed.or(file.speed),
@@ -241,6 +249,10 @@ impl Args {
             sensors,
             actuators,
             position: parsed("--position", &declared.position)?,
+            pose: declared
+                .pose
+                .resolve()
+                .map_err(|(field, reason)| ConfigError::Field { field, reason })?,
             map: declared.map.clone().unwrap_or_else(|| DEFAULT_MAP.to_owned()),
             cpu: parsed("--cpu", &declared.cpu)?,
             memory: parsed("--memory", &declared.memory)?,

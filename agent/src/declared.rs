@@ -7,6 +7,7 @@ use std::path::Path;
 use serde::{Deserialize, Serialize};
 
 use crate::durable::{self, FileError, Keep};
+use crate::position::settings::PoseArgs;
 
 const FILE: &str = "declared.json";
 
@@ -20,6 +21,7 @@ pub(crate) struct Declared {
     pub(crate) ar_res: Option<String>,
     pub(crate) map: Option<String>,
     pub(crate) position: Option<String>,
+    pub(crate) pose: PoseArgs,
     pub(crate) cpu: Option<String>,
     pub(crate) memory: Option<String>,
     pub(crate) speed: Option<f64>,
@@ -53,6 +55,7 @@ impl Declared {
         one("--ar-res", fill(&mut self.ar_res, last.ar_res));
         one("--map", fill(&mut self.map, last.map));
         one("--position", fill(&mut self.position, last.position));
+        self.pose.fill(last.pose).into_iter().for_each(|flag| one(flag, true));
         one("--cpu", fill(&mut self.cpu, last.cpu));
         one("--memory", fill(&mut self.memory, last.memory));
         one("--speed", fill(&mut self.speed, last.speed));

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
-use muster_api::condition::{Condition, DISK_PRESSURE, LOCALIZED, QUOTAS_ENFORCED};
+use muster_api::condition::{Condition, DISK_PRESSURE, LOCALIZED, POSE_FRESH, QUOTAS_ENFORCED};
 use muster_api::kind::node::RuntimeStatus;
 use muster_api::pose::Pose;
 use muster_api::wire::agent::v1 as proto;
@@ -74,7 +74,10 @@ impl Node {
             mission_locks: Vec::new(),
         };
         let position = match facts.kind {
-            Kind::Robot => config.position.as_ref().map(|source| source.open(&config.map)),
+            Kind::Robot => config
+                .position
+                .as_ref()
+                .map(|source| source.open(&config.map, shared.node.as_str(), &config.pose)),
             Kind::Cloud => None,
         };
         let battery = match facts.kind {
@@ -127,13 +130,13 @@ impl Node {
             None => Condition::new(DISK_PRESSURE, false, "EnoughSpace", String::new()),
         });
         if let Some(position) = &self.position {
-            let pose = position.current();
-            let (localized, reason) = match pose.map(|pose| pose.localized) {
-                Some(true) => (true, "Localized"),
-                Some(false) => (false, "Lost"),
-                None => (false, "NoPose"),
-            };
-            conditions.push(Condition::new(LOCALIZED, localized, reason, String::new()));
+            let seen = position.seen();
+            let verdicts = [(POSE_FRESH, seen.fresh), (LOCALIZED, Some(seen.localized))];
+            for (condition, verdict) in verdicts {
+                conditions.extend(
+                    verdict.map(|v| Condition::new(condition, v.holds, v.reason, v.message)),
+                );
+            }
         }
         let battery = self.battery.as_ref().and_then(BatteryGauge::charge);
         let mission_locks =

@@ -69,6 +69,8 @@ pub const BATTERY: &str = "Battery";
 pub const MAINTENANCE: &str = "Maintenance";
 /// The disk of the agent's data directory is nearly full: nothing new begins there.
 pub const DISK_PRESSURE: &str = "DiskPressure";
+/// What the robot's pose is read from says something new in time.
+pub const POSE_FRESH: &str = "PoseFresh";
 /// The robot knows where it is.
 pub const LOCALIZED: &str = "Localized";
 /// Quotas of tasks are enforced by the kernel on this node (invariant 7).

@@ -46,6 +46,33 @@ pub struct Pose {
     /// False: the robot does not know where it is, and location-based placement leaves it out.
     #[serde(default = "yes")]
     pub localized: bool,
+    /// How sure it is; absent: its source does not say.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub covariance: Option<Covariance>,
+}
+
+/// The part of a pose's covariance that matters on a floor, in the frame of the pose's map.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "camelCase", deny_unknown_fields)]
+pub struct Covariance {
+    /// Variance of x, m².
+    pub xx: f64,
+    /// Covariance of x and y, m².
+    pub xy: f64,
+    /// Variance of y, m².
+    pub yy: f64,
+    /// Variance of the heading, rad².
+    pub yaw: f64,
+}
+
+impl Covariance {
+    /// The standard deviation of the position in the direction in which it is worst, metres: the root of the larger
+    /// eigenvalue.
+    #[must_use]
+    pub fn deviation(&self) -> f64 {
+        let (mean, half) = ((self.xx + self.yy) / 2.0, (self.xx - self.yy) / 2.0);
+        (mean + half.hypot(self.xy)).max(0.0).sqrt()
+    }
 }
 
 impl Pose {
@@ -67,6 +94,7 @@ impl Pose {
             stamp: self.stamp.as_ref().map(|s| s.0),
             source: &self.source,
             localized: self.localized,
+            covariance: self.covariance,
         }
     }
 
@@ -81,6 +109,7 @@ impl Pose {
         keep(&mut self.source, new.source);
         (self.x, self.y, self.z, self.yaw) = (new.x, new.y, new.z, new.yaw);
         (self.stamp, self.localized) = (new.stamp.map(MicroTime), new.localized);
+        self.covariance = new.covariance;
     }
 }
 
@@ -103,6 +132,8 @@ pub struct PoseRef<'a> {
     pub source: &'a str,
     /// False: the robot is not where this says.
     pub localized: bool,
+    /// How sure it is.
+    pub covariance: Option<Covariance>,
 }
 
 impl PoseRef<'_> {
@@ -125,6 +156,7 @@ impl From<PoseRef<'_>> for Pose {
             stamp: pose.stamp.map(MicroTime),
             source: pose.source.to_owned(),
             localized: pose.localized,
+            covariance: pose.covariance,
         }
     }
 }
@@ -223,7 +255,17 @@ mod tests {
             stamp: None,
             source: String::new(),
             localized: true,
+            covariance: None,
         }
+    }
+
+    #[test]
+    fn the_deviation_is_that_of_the_worst_direction() {
+        let of = |xx, xy, yy| Covariance { xx, xy, yy, yaw: 0.0 }.deviation();
+        assert_eq!((of(0.25, 0.0, 0.0), of(0.0, 0.0, 4.0)), (0.5, 2.0));
+        // Along the diagonal: variance 2, and none across it.
+        assert!((of(1.0, 1.0, 1.0) - 2.0_f64.sqrt()).abs() < 1e-12);
+        assert_eq!(of(-1.0, 0.0, -1.0), 0.0);
     }
 
     #[test]

@@ -294,6 +294,14 @@ impl Cluster {
         self.node_ready(name).await;
     }
 
+    /// Changes a flag of an agent's command line, for its next start.
+    pub fn set_flag(&mut self, name: &str, from: &str, to: &str) {
+        let agent = self.agents.get_mut(name).expect("an agent of this cluster");
+        let flag =
+            agent.options.flags.iter_mut().find(|flag| *flag == from).expect("it has this flag");
+        to.clone_into(flag);
+    }
+
     /// Waits until a node is ready.
     pub async fn node_ready(&self, name: &str) -> Node {
         let ready =

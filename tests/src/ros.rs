@@ -130,10 +130,20 @@ impl Ros {
     /// Starts a program.
     #[must_use]
     pub fn spawn(&self, program: &str, arguments: &[&str]) -> Program {
+        self.spawn_with(program, arguments, &[])
+    }
+
+    fn spawn_with(
+        &self,
+        program: &str,
+        arguments: &[&str],
+        environment: &[(&str, &str)],
+    ) -> Program {
         let what = format!("{program} {arguments:?}");
         let mut child = self
             .command(program)
             .args(arguments)
+            .envs(environment.iter().copied())
             .stdout(Stdio::piped())
             .spawn()
             .expect("it is installed");
@@ -144,9 +154,20 @@ impl Ros {
     /// Starts a script of `tests/ros`, on Debian's Python.
     #[must_use]
     pub fn script(&self, name: &str, arguments: &[&str]) -> Program {
+        self.script_with(name, arguments, &[])
+    }
+
+    /// The same with variables of its environment.
+    #[must_use]
+    pub fn script_with(
+        &self,
+        name: &str,
+        arguments: &[&str],
+        environment: &[(&str, &str)],
+    ) -> Program {
         let path = format!("{}/ros/{name}", env!("CARGO_MANIFEST_DIR"));
         let all: Vec<&str> = [&*path].into_iter().chain(arguments.iter().copied()).collect();
-        self.spawn("/usr/bin/python3", &all)
+        self.spawn_with("/usr/bin/python3", &all, environment)
     }
 }
 

@@ -12,6 +12,7 @@
 //! | [`depend`] | the tasks that a task waits for: how far they are, and who was started again |
 //! | [`report`] | what is told to the controller, and its sequence |
 //! | [`executor`] | an executor and the works it was given: who may end, and on whose word |
+//! | [`pose`] | where the robot is by what ROS says: frames, transforms, whether it counts |
 //! | [`plan`] | a set of assignments against the tasks that are known: who gets which event |
 //!
 //! The executor (`muster-agent`'s `driver`) keeps three promises that the proofs here rest on:
@@ -25,6 +26,7 @@ pub mod event;
 pub mod executor;
 pub mod observed;
 pub mod plan;
+pub mod pose;
 pub mod probe;
 pub mod report;
 pub mod restart;

@@ -18,7 +18,7 @@ use tokio::sync::watch;
 use tokio::time::MissedTickBehavior;
 use tokio_util::task::AbortOnDropHandle;
 
-use super::Position;
+use super::{Position, Seen};
 
 /// As often as the controller is told. A look costs some ten microseconds; a watch of the kernel's would have to follow
 /// the file through renames and directories that come and go.
@@ -35,12 +35,12 @@ enum Found {
 }
 
 pub(super) fn open(path: &Path, map: &str) -> Position {
-    let (say, newest) = watch::channel(None);
+    let (say, newest) = watch::channel(Seen::default());
     let source = tokio::spawn(follow(path.to_owned(), map.to_owned(), say));
     Position { newest, _source: Some(AbortOnDropHandle::new(source)) }
 }
 
-async fn follow(path: PathBuf, map: String, say: watch::Sender<Option<Pose>>) {
+async fn follow(path: PathBuf, map: String, say: watch::Sender<Seen>) {
     let mut ticks = tokio::time::interval(EVERY);
     ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
     let mut told = String::new();
@@ -55,10 +55,10 @@ async fn follow(path: PathBuf, map: String, say: watch::Sender<Option<Pose>>) {
             tracing::warn!(path = %path.display(), why, "the robot's place is not known");
         }
         told = if let Found::Nothing(why) = &found { why.clone() } else { String::new() };
-        say.send_if_modified(|pose| {
-            let new = follows(pose.as_ref(), &found, &map);
-            let changes = new != *pose;
-            *pose = new;
+        say.send_if_modified(|seen| {
+            let new = Seen::of(follows(seen.pose.as_ref(), &found, &map));
+            let changes = new != *seen;
+            *seen = new;
             changes
         });
     }
@@ -69,8 +69,17 @@ fn follows(before: Option<&Pose>, found: &Found, map: &str) -> Option<Pose> {
     match found {
         Found::At([x, y, z, yaw], stamp) => {
             let (x, y, z, yaw) = (*x, *y, *z, *yaw);
-            let pose =
-                PoseRef { map, x, y, z, yaw, stamp: *stamp, source: "file", localized: true };
+            let pose = PoseRef {
+                map,
+                x,
+                y,
+                z,
+                yaw,
+                stamp: *stamp,
+                source: "file",
+                localized: true,
+                covariance: None,
+            };
             Some(pose.into())
         }
         Found::Half => before.cloned(),

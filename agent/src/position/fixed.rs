@@ -3,7 +3,7 @@
 use muster_api::pose::{FixedPosition, Pose};
 use tokio::sync::watch;
 
-use super::Position;
+use super::{Position, Seen};
 
 pub(super) fn open(place: FixedPosition, map: &str) -> Position {
     let pose = Pose {
@@ -16,7 +16,8 @@ pub(super) fn open(place: FixedPosition, map: &str) -> Position {
         stamp: None,
         source: "static".to_owned(),
         localized: true,
+        covariance: None,
     };
     // Nobody ever says anything else: the sender is not kept.
-    Position { newest: watch::channel(Some(pose)).1, _source: None }
+    Position { newest: watch::channel(Seen::of(Some(pose))).1, _source: None }
 }

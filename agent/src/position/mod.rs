@@ -1,36 +1,74 @@
-//! Where the robot is. A source is named by a scheme: `static:X,Y[,YAW]`, `file:PATH`.
+//! Where the robot is. A source is named by a scheme: `static:X,Y[,YAW]`, `file:PATH`, `ros1:TOPIC`.
 //!
-//! A source is a task that puts the newest pose into a watch channel at its own pace, and asks nobody. The session tells
+//! A source is a task that puts the newest pose, and whether it counts, into a watch channel at its own pace, and asks nobody. The session tells
 //! the controller what is newest when it has told the last one; nothing queues up. A new scheme is a variant of
 //! [`PositionSource`] and a module that gives a [`Position`].
 
 mod file;
 mod fixed;
+mod ros1;
+pub(crate) mod settings;
 
 use std::path::PathBuf;
 use std::str::FromStr;
 
+use muster_agent_core::pose::judge::Verdict;
 use muster_api::pose::{FixedPosition, FixedPositionError, Pose};
 use tokio::sync::watch;
 use tokio_util::task::AbortOnDropHandle;
 
+use self::settings::PoseSettings;
+
+/// What a source says.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct Seen {
+    /// In the map frame; `None`: not known yet.
+    pub(crate) pose: Option<Pose>,
+    /// Whether it is new enough; `None`: it does not grow old.
+    pub(crate) fresh: Option<Verdict>,
+    /// Whether the robot knows where it is.
+    pub(crate) localized: Verdict,
+}
+
+impl Default for Seen {
+    fn default() -> Self {
+        Seen::of(None)
+    }
+}
+
+impl Seen {
+    /// A pose that is true until there is another one.
+    fn of(pose: Option<Pose>) -> Self {
+        let localized = match pose.as_ref().map(|pose| pose.localized) {
+            Some(true) => Verdict::yes("Localized"),
+            Some(false) => Verdict::no("Lost", String::new()),
+            None => Verdict::no("NoPose", String::new()),
+        };
+        Seen { pose, fresh: None, localized }
+    }
+}
+
 /// Tells where the robot is; its source ends with it.
 #[derive(Debug)]
 pub(crate) struct Position {
-    /// In the map frame; `None`: not known yet.
-    newest: watch::Receiver<Option<Pose>>,
+    newest: watch::Receiver<Seen>,
     _source: Option<AbortOnDropHandle<()>>,
 }
 
 impl Position {
     /// The newest pose; `None`: not known yet.
     pub(crate) fn current(&self) -> Option<Pose> {
+        self.newest.borrow().pose.clone()
+    }
+
+    /// Whether it counts, and why not.
+    pub(crate) fn seen(&self) -> Seen {
         self.newest.borrow().clone()
     }
 
     /// Ready when the robot is known to be somewhere else than `told`, or later there. Cancel safe.
     pub(crate) async fn other_than(&mut self, told: Option<&Pose>) {
-        if self.newest.wait_for(|pose| pose.as_ref() != told).await.is_err() {
+        if self.newest.wait_for(|seen| seen.pose.as_ref() != told).await.is_err() {
             // The source has said all that it ever will.
             std::future::pending().await
         }
@@ -44,17 +82,21 @@ pub(crate) enum PositionSource {
     Static(FixedPosition),
     /// Some program of the robot's keeps its pose in a file.
     File(PathBuf),
+    /// A topic of ROS 1.
+    Ros1(String),
 }
 
 /// Why a text names no source.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub(crate) enum PositionSourceError {
-    #[error("{0:?} names no position source; write static:X,Y[,YAW] or file:PATH")]
+    #[error("{0:?} names no position source; write static:X,Y[,YAW], file:PATH or ros1:TOPIC")]
     Scheme(String),
     #[error("in static:")]
     Static(#[source] FixedPositionError),
     #[error("file:{0} is no absolute path; write file:/run/robot/pose")]
     File(String),
+    #[error(transparent)]
+    Topic(#[from] muster_ros1::name::NameError),
 }
 
 impl FromStr for PositionSource {
@@ -67,17 +109,23 @@ impl FromStr for PositionSource {
             }
             Some(("file", path)) if path.starts_with('/') => Ok(PositionSource::File(path.into())),
             Some(("file", path)) => Err(PositionSourceError::File(path.to_owned())),
+            Some(("ros1", topic)) => {
+                // A private name would be below the agent's own node, which publishes nothing.
+                muster_ros1::name::Resolver::new("/", "agent", [])?.resolve(topic)?;
+                Ok(PositionSource::Ros1(topic.to_owned()))
+            }
             _ => Err(PositionSourceError::Scheme(text.to_owned())),
         }
     }
 }
 
 impl PositionSource {
-    /// Starts the source; its poses are in `map`.
-    pub(crate) fn open(&self, map: &str) -> Position {
+    /// Starts the source of the robot `name`; its poses are in `map`.
+    pub(crate) fn open(&self, map: &str, name: &str, settings: &PoseSettings) -> Position {
         match self {
             PositionSource::Static(place) => fixed::open(*place, map),
             PositionSource::File(path) => file::open(path, map),
+            PositionSource::Ros1(topic) => ros1::open(topic, map, name, settings),
         }
     }
 }
@@ -90,7 +138,9 @@ mod tests {
     fn a_source_is_named_by_its_scheme() {
         let file = PositionSource::File("/run/pose".into());
         assert_eq!("file:/run/pose".parse(), Ok(file));
-        let bad = ["file:pose", "file:", "/run/pose", "ros9:/odom", "static:1"];
+        assert_eq!("ros1:/odom".parse(), Ok(PositionSource::Ros1("/odom".to_owned())));
+        let bad =
+            ["ros1:", "ros1:/a b", "file:pose", "file:", "/run/pose", "ros9:/odom", "static:1"];
         for text in bad {
             assert!(text.parse::<PositionSource>().is_err(), "{text}");
         }

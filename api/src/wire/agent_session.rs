@@ -14,7 +14,7 @@ use crate::kind::task::depend::DependencyCondition;
 use crate::kind::task::{TaskSpec, TaskUsage};
 use crate::name::FunctionName;
 use crate::phase::TaskPhase;
-use crate::pose::Pose;
+use crate::pose::{Covariance, Pose};
 use crate::quantity::{Bytes, MilliCpu};
 use crate::resource::Compute;
 
@@ -120,6 +120,12 @@ impl From<&Pose> for proto::Pose {
             stamp: pose.stamp.as_ref().map(timestamp_to_wire),
             source: pose.source.clone(),
             localized: pose.localized,
+            covariance: pose.covariance.map(|c| proto::Covariance {
+                xx: c.xx,
+                xy: c.xy,
+                yy: c.yy,
+                yaw: c.yaw,
+            }),
         }
     }
 }
@@ -143,8 +149,17 @@ impl TryFrom<&proto::Pose> for Pose {
             stamp: pose.stamp.as_ref().map(|s| timestamp_from_wire("pose.stamp", s)).transpose()?,
             source: pose.source.clone(),
             localized: pose.localized,
+            covariance: pose.covariance.as_ref().map(covariance).transpose()?,
         })
     }
+}
+
+fn covariance(of: &proto::Covariance) -> Result<Covariance, WireError> {
+    let proto::Covariance { xx, xy, yy, yaw } = *of;
+    if ![xx, xy, yy, yaw].iter().all(|n| n.is_finite()) {
+        return Err(WireError::invalid("pose.covariance", "a variance is not a finite number"));
+    }
+    Ok(Covariance { xx, xy, yy, yaw })
 }
 
 impl From<&RuntimeStatus> for proto::Runtime {
@@ -356,6 +371,7 @@ mod tests {
                 stamp: Some(MicroTime(Timestamp::from_second(5).expect("in range"))),
                 source: "static".to_owned(),
                 localized: true,
+                covariance: Some(Covariance { xx: 0.25, xy: 0.01, yy: 0.5, yaw: 0.1 }),
             }),
             runtimes: Vec::new(),
             conditions: Vec::new(),

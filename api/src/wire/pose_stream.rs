@@ -28,6 +28,7 @@ pub fn pose_of<'a>(
         stamp: stamp.map_err(|e| WireError::invalid("pose.stamp", e))?,
         source: &batch.source,
         localized: !one.lost,
+        covariance: None,
     })
 }
 

@@ -162,6 +162,7 @@ fn pose(at: Point3<f64>) -> Pose {
         stamp: None,
         source: String::new(),
         localized: true,
+        covariance: None,
     }
 }
 

@@ -30,6 +30,7 @@ pub(crate) fn node(kind: NodeKind, cpu: u64, at: Option<(f64, f64)>) -> Node {
             stamp: None,
             source: String::new(),
             localized: true,
+            covariance: None,
         }),
         conditions: vec![Condition {
             r#type: condition::READY.to_owned(),

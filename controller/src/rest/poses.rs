@@ -19,7 +19,7 @@ use futures::stream;
 use http::StatusCode;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::MicroTime;
 use muster_api::name::NodeName;
-use muster_api::pose::Pose;
+use muster_api::pose::{Covariance, Pose};
 use muster_controller_core::node_health::Monotonic;
 use muster_controller_core::poses::{Cursor, Known};
 use serde::Serialize;
@@ -80,6 +80,8 @@ struct Item<'a> {
     stamp: Option<&'a MicroTime>,
     source: &'a str,
     localized: bool,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    covariance: Option<Covariance>,
     /// Since it came, milliseconds; none: it is the checkpoint of before the controller began.
     #[serde(skip_serializing_if = "Option::is_none")]
     age_ms: Option<u64>,
@@ -110,6 +112,7 @@ impl Seen {
             stamp: pose.stamp.as_ref(),
             source: &pose.source,
             localized: pose.localized,
+            covariance: pose.covariance,
             age_ms: self.heard.map(|heard| poses.age_ms(heard)),
         }
     }

@@ -4,11 +4,12 @@
 //! |---|---|
 //! | [`registrar`] | one task: keeps the master's knowledge of this node as it should be |
 //! | [`slave`] | the API that the master and other nodes call |
-//! | [`subscription`] | a task a topic, and one below it for each publisher |
+//! | [`subscription`] | a task a topic, and one below it for each publisher: [`link`] |
 //! | [`publication`] | a task for all who connect, and one for each subscriber |
 //! | [`bus`] | every connection, for `rosnode info` |
 
 mod bus;
+mod link;
 mod publication;
 mod registrar;
 mod slave;
@@ -245,9 +246,11 @@ impl Node {
     /// goes on until it is dropped.
     pub async fn ended(&self) -> String {
         let mut ended = self.shared.ended.subscribe();
-        match ended.wait_for(Option::is_some).await {
-            Ok(why) => why.clone().unwrap_or_default(),
-            Err(_) => std::future::pending().await,
+        let why = ended.wait_for(Option::is_some).await.ok().and_then(|why| why.clone());
+        match why {
+            Some(why) => why,
+            // The node is gone, and whoever waits with it.
+            None => std::future::pending().await,
         }
     }
 
@@ -261,7 +264,7 @@ impl Node {
         topic: &str,
         options: SubscribeOptions,
     ) -> Result<Subscriber<M>, NodeError> {
-        let subscription = self.add(topic, (M::TYPE, M::MD5), options)?;
+        let subscription = self.add(topic, (M::TYPE, M::MD5), options, None)?;
         Ok(Subscriber::new(subscription, Arc::clone(&self.shared)))
     }
 
@@ -275,7 +278,7 @@ impl Node {
         topic: &str,
         options: SubscribeOptions,
     ) -> Result<Subscriber<Incoming>, NodeError> {
-        let subscription = self.add(topic, ("*", "*"), options)?;
+        let subscription = self.add(topic, ("*", "*"), options, None)?;
         Ok(Subscriber::new(subscription, Arc::clone(&self.shared)))
     }
 
@@ -285,8 +288,8 @@ impl Node {
     ///
     /// As [`Node::subscribe`].
     pub fn count(&self, topic: &str, window: Duration) -> Result<Arrivals, NodeError> {
-        let options = SubscribeOptions { count: Some(window), ..SubscribeOptions::default() };
-        let subscription = self.add(topic, ("*", "*"), options)?;
+        let subscription =
+            self.add(topic, ("*", "*"), SubscribeOptions::default(), Some(window))?;
         Ok(Arrivals::new(subscription, Arc::clone(&self.shared)))
     }
 
@@ -295,6 +298,7 @@ impl Node {
         topic: &str,
         kind: (&'static str, &'static str),
         options: SubscribeOptions,
+        count: Option<Duration>,
     ) -> Result<Arc<Subscription>, NodeError> {
         let topic = self.names.resolve(topic)?;
         let mut topics = self.shared.topics();
@@ -302,7 +306,7 @@ impl Node {
             return Err(NodeError::Twice { what: "subscribes", topic });
         }
         topics.leaving.remove(&Leaving::Subscription(topic.clone()));
-        let subscription = Subscription::start(&self.shared, topic.clone(), kind, options);
+        let subscription = Subscription::start(&self.shared, topic.clone(), kind, options, count);
         topics.subscriptions.insert(topic, Arc::clone(&subscription));
         drop(topics);
         self.shared.work.notify_one();

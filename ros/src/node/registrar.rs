@@ -82,7 +82,7 @@ pub(super) fn chain(error: &dyn std::error::Error) -> String {
 /// A master that does not answer may come back without memory.
 fn forget(shared: &Shared) {
     let topics = shared.topics();
-    topics.subscriptions.values().for_each(|s| s.doubt());
+    topics.subscriptions.values().for_each(|s| s.forget());
     topics.publications.values().for_each(|p| p.set_registered(false));
     topics.params.values().for_each(|p| *lock(&p.registered) = false);
 }

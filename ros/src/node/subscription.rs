@@ -7,30 +7,18 @@ use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use bytes::Bytes;
-use tokio::io::{AsyncWriteExt as _, BufReader};
-use tokio::net::TcpStream;
 use tokio::sync::watch;
 use tokio::time::Instant;
 use tokio_util::task::AbortOnDropHandle;
 
-use super::bus::{Connection, Direction};
-use super::registrar::chain;
+use super::link::attend;
 use super::{Leaving, Shared, lock};
-use crate::master::{MasterError, unpack};
 use crate::message::Message;
 use crate::queue::Queue;
 use crate::rate::RateMeter;
-use crate::tcpros::{
-    Header, HeaderError, LARGEST_FRAME, LARGEST_HEADER, ReadError, read_frame, skip_frame,
-};
+use crate::tcpros::LARGEST_FRAME;
 use crate::wire::DecodeError;
-use crate::xmlrpc::Value;
-use crate::xmlrpc::http::{CallError, Uri, invoke};
-
-/// First and longest pause before a publisher is tried again. One that was killed stays in the master's list for ever.
-const PAUSE: (Duration, Duration) = (Duration::from_millis(50), Duration::from_secs(5));
-/// For connecting, and for each header.
-const PATIENCE: Duration = Duration::from_secs(5);
+use crate::xmlrpc::http::Uri;
 
 /// How a topic is subscribed.
 #[derive(Debug, Clone)]
@@ -39,13 +27,11 @@ pub struct SubscribeOptions {
     pub queue: usize,
     /// The largest message that is taken, bytes: a publisher that announces more is left alone.
     pub largest: usize,
-    /// Only count, over this window.
-    pub(super) count: Option<Duration>,
 }
 
 impl Default for SubscribeOptions {
     fn default() -> Self {
-        SubscribeOptions { queue: 10, largest: LARGEST_FRAME, count: None }
+        SubscribeOptions { queue: 10, largest: LARGEST_FRAME }
     }
 }
 
@@ -82,6 +68,21 @@ pub struct SubscriptionStatus {
     pub trouble: Option<String>,
 }
 
+/// Who publishes a topic.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+struct Publishers {
+    /// By the master.
+    listed: BTreeSet<Uri>,
+    /// By an earlier master, for as long as they are connected.
+    kept: BTreeSet<Uri>,
+}
+
+impl Publishers {
+    fn all(&self) -> BTreeSet<Uri> {
+        &self.listed | &self.kept
+    }
+}
+
 /// One topic. Public only as a part of the node's own types.
 #[derive(Debug)]
 pub struct Subscription {
@@ -89,14 +90,18 @@ pub struct Subscription {
     kind: &'static str,
     md5: &'static str,
     options: SubscribeOptions,
+    /// Messages are counted only, over this window.
+    count: Option<Duration>,
     queue: Queue<Incoming>,
     meter: Mutex<RateMeter>,
     began: Instant,
-    publishers: watch::Sender<BTreeSet<Uri>>,
+    publishers: watch::Sender<Publishers>,
     /// By publisher: connected, or why not.
     peers: watch::Sender<BTreeMap<Uri, Result<(), String>>>,
     /// Who publishes it is to be asked of the master.
     doubt: AtomicBool,
+    /// The master that is asked next may be a new one, which knows nothing.
+    forgotten: AtomicBool,
     follower: Mutex<Option<AbortOnDropHandle<()>>>,
 }
 
@@ -106,18 +111,21 @@ impl Subscription {
         topic: String,
         (kind, md5): (&'static str, &'static str),
         options: SubscribeOptions,
+        count: Option<Duration>,
     ) -> Arc<Subscription> {
         let subscription = Arc::new(Subscription {
             topic,
             kind,
             md5,
             queue: Queue::new(options.queue),
-            meter: Mutex::new(RateMeter::new(options.count.unwrap_or(Duration::from_secs(1)))),
+            meter: Mutex::new(RateMeter::new(count.unwrap_or(Duration::from_secs(1)))),
             options,
+            count,
             began: Instant::now(),
-            publishers: watch::Sender::new(BTreeSet::new()),
+            publishers: watch::Sender::new(Publishers::default()),
             peers: watch::Sender::new(BTreeMap::new()),
             doubt: AtomicBool::new(true),
+            forgotten: AtomicBool::new(false),
             follower: Mutex::new(None),
         });
         let follower = tokio::spawn(follow(Arc::clone(&subscription), Arc::clone(shared)));
@@ -132,6 +140,27 @@ impl Subscription {
 
     pub(super) fn topic(&self) -> &str {
         &self.topic
+    }
+
+    pub(super) fn md5(&self) -> &'static str {
+        self.md5
+    }
+
+    pub(super) fn largest(&self) -> usize {
+        self.options.largest
+    }
+
+    /// Messages are not kept.
+    pub(super) fn only_counts(&self) -> bool {
+        self.count.is_some()
+    }
+
+    pub(super) fn arrived(&self) {
+        lock(&self.meter).arrived(self.began.elapsed());
+    }
+
+    pub(super) fn push(&self, incoming: Incoming) {
+        self.queue.push(incoming);
     }
 
     pub(super) fn kind(&self) -> &'static str {
@@ -150,25 +179,52 @@ impl Subscription {
         self.doubt.load(Ordering::Acquire)
     }
 
+    /// As [`Subscription::doubt`], of a master that is gone or does not know this node.
+    pub(super) fn forget(&self) {
+        self.forgotten.store(true, Ordering::Release);
+        self.doubt();
+    }
+
+    /// What the master says. A new master knows no publisher that has not registered again, and few do: those that are
+    /// connected stay so.
     pub(super) fn set_publishers(&self, uris: &[String]) {
-        let new: BTreeSet<Uri> = uris.iter().filter_map(|uri| uri.parse().ok()).collect();
+        let listed: BTreeSet<Uri> = uris.iter().filter_map(|uri| uri.parse().ok()).collect();
+        let forgotten = self.forgotten.swap(false, Ordering::AcqRel);
+        let connected: BTreeSet<Uri> = self
+            .peers
+            .borrow()
+            .iter()
+            .filter(|(_, how)| how.is_ok())
+            .map(|(uri, _)| uri.clone())
+            .collect();
         self.publishers.send_if_modified(|old| {
+            let mut kept = if forgotten { connected } else { old.kept.clone() };
+            kept.retain(|uri| !listed.contains(uri));
+            let new = Publishers { listed, kept };
             let changed = *old != new;
             *old = new;
             changed
         });
     }
 
+    /// A connection broke: a publisher that only it held is none any more.
+    pub(super) fn let_go(&self, uri: &Uri) {
+        self.publishers.send_if_modified(|publishers| publishers.kept.remove(uri));
+    }
+
     fn status(&self) -> SubscriptionStatus {
-        let peers = self.peers.borrow();
+        let (peers, publishers) = (self.peers.borrow(), self.publishers.borrow().all());
+        // What a task said just before it was ended may still stand there.
+        let of_now =
+            || peers.iter().filter(|(uri, _)| publishers.contains(*uri)).map(|(_, how)| how);
         SubscriptionStatus {
-            publishers: self.publishers.borrow().len(),
-            connected: peers.values().filter(|peer| peer.is_ok()).count(),
-            trouble: peers.values().find_map(|peer| peer.clone().err()),
+            publishers: publishers.len(),
+            connected: of_now().filter(|how| how.is_ok()).count(),
+            trouble: of_now().find_map(|how| how.clone().err()),
         }
     }
 
-    fn say(&self, uri: &Uri, how: Result<(), String>) {
+    pub(super) fn say(&self, uri: &Uri, how: Result<(), String>) {
         self.peers.send_if_modified(|peers| {
             let changed = peers.get(uri) != Some(&how);
             peers.insert(uri.clone(), how);
@@ -182,7 +238,7 @@ async fn follow(subscription: Arc<Subscription>, shared: Arc<Shared>) {
     let mut publishers = subscription.publishers.subscribe();
     let mut connections: BTreeMap<Uri, AbortOnDropHandle<()>> = BTreeMap::new();
     loop {
-        let wanted = publishers.borrow_and_update().clone();
+        let wanted = publishers.borrow_and_update().all();
         connections.retain(|uri, _| wanted.contains(uri));
         subscription.peers.send_if_modified(|peers| {
             let before = peers.len();
@@ -198,138 +254,6 @@ async fn follow(subscription: Arc<Subscription>, shared: Arc<Shared>) {
         if publishers.changed().await.is_err() {
             return;
         }
-    }
-}
-
-/// Why a publisher is not connected.
-#[derive(Debug, thiserror::Error)]
-enum LinkError {
-    #[error("failed to ask {uri} for the topic")]
-    Ask { uri: Uri, source: Box<CallError> },
-    #[error(transparent)]
-    Answer(#[from] MasterError),
-    #[error("failed to connect to {host}:{port}")]
-    Connect { host: String, port: u16, source: std::io::Error },
-    #[error("it did not answer in time")]
-    Timeout,
-    #[error("its connection header is none")]
-    Header(#[from] HeaderError),
-    #[error("it refuses: {0}")]
-    Refused(String),
-    #[error("it publishes {kind} with checksum {md5}, not {wanted}")]
-    OtherType { kind: String, md5: String, wanted: &'static str },
-    #[error(transparent)]
-    Read(#[from] ReadError),
-}
-
-/// Keeps one publisher connected.
-async fn attend(uri: Uri, subscription: Arc<Subscription>, shared: Arc<Shared>) {
-    let mut pause = PAUSE.0;
-    let connection = shared.bus.add(Direction::In, &subscription.topic, &uri.to_string());
-    loop {
-        let begun = Instant::now();
-        let ended = link(&uri, &subscription, &shared, &connection).await;
-        connection.set_connected(false);
-        let Err(error) = ended;
-        let why = chain(&error);
-        tracing::debug!(topic = subscription.topic, publisher = %uri, why, "not connected to a publisher");
-        subscription.say(&uri, Err(why));
-        if begun.elapsed() > PAUSE.1 {
-            pause = PAUSE.0;
-        }
-        tokio::time::sleep(pause).await;
-        pause = (pause * 2).min(PAUSE.1);
-    }
-}
-
-async fn link(
-    uri: &Uri,
-    subscription: &Subscription,
-    shared: &Shared,
-    connection: &Connection,
-) -> Result<std::convert::Infallible, LinkError> {
-    let opened = tokio::time::timeout(PATIENCE * 2, open(uri, subscription, shared));
-    let (mut stream, from) = opened.await.map_err(|_| LinkError::Timeout)??;
-    connection.set_connected(true);
-    subscription.say(uri, Ok(()));
-    loop {
-        let size = if subscription.options.count.is_some() {
-            skip_frame(&mut stream, subscription.options.largest).await?
-        } else {
-            let body = read_frame(&mut stream, subscription.options.largest).await?;
-            let (size, received) = (body.len(), Instant::now());
-            subscription.queue.push(Incoming { body, received, from: Arc::clone(&from) });
-            size
-        };
-        lock(&subscription.meter).arrived(subscription.began.elapsed());
-        connection.passed(size);
-    }
-}
-
-/// A connection on which messages follow.
-async fn open(
-    uri: &Uri,
-    subscription: &Subscription,
-    shared: &Shared,
-) -> Result<(BufReader<TcpStream>, Arc<From>), LinkError> {
-    let (host, port) = ask(uri, subscription, shared).await?;
-    let connected = TcpStream::connect((&*host, port)).await;
-    let stream = connected.map_err(|source| LinkError::Connect { host, port, source })?;
-    keep_alive(&stream);
-    let header = Header::new([
-        ("callerid", &*shared.name),
-        ("topic", &*subscription.topic),
-        ("type", subscription.kind),
-        ("md5sum", subscription.md5),
-        ("tcp_nodelay", "1"),
-    ]);
-    let mut stream = BufReader::new(stream);
-    stream.write_all(&header.encode()).await.map_err(ReadError::from)?;
-    let answer = Header::decode(&read_frame(&mut stream, LARGEST_HEADER).await?)?;
-    if let Some(error) = answer.get("error") {
-        return Err(LinkError::Refused(error.to_owned()));
-    }
-    let field = |key| answer.get(key).unwrap_or_default().to_owned();
-    let from = From { caller: field("callerid"), kind: field("type"), md5: field("md5sum") };
-    let fits = |wanted: &str, found: &str| wanted == "*" || found == "*" || wanted == found;
-    if !fits(subscription.md5, &from.md5) {
-        return Err(LinkError::OtherType {
-            kind: from.kind,
-            md5: from.md5,
-            wanted: subscription.kind,
-        });
-    }
-    Ok((stream, Arc::new(from)))
-}
-
-/// Where the publisher gives the topic.
-async fn ask(
-    uri: &Uri,
-    subscription: &Subscription,
-    shared: &Shared,
-) -> Result<(String, u16), LinkError> {
-    let protocols = Value::Array(vec![Value::Array(vec!["TCPROS".into()])]);
-    let params = [(&*shared.name).into(), (&*subscription.topic).into(), protocols];
-    let answer = invoke(uri, "requestTopic", &params).await;
-    let answer =
-        answer.map_err(|source| LinkError::Ask { uri: uri.clone(), source: Box::new(source) })?;
-    Ok(unpack("requestTopic", &answer, |value| match value.as_array()? {
-        [protocol, host, port, ..] if protocol.as_str() == Some("TCPROS") => {
-            Some((host.as_str()?.to_owned(), u16::try_from(port.as_int()?).ok()?))
-        }
-        _ => None,
-    })?)
-}
-
-/// A publisher whose machine lost power says nothing, and a topic may be silent for hours: the kernels ask each other.
-fn keep_alive(stream: &TcpStream) {
-    use rustix::net::sockopt;
-    let idle = sockopt::set_socket_keepalive(stream, true)
-        .and_then(|()| sockopt::set_tcp_keepidle(stream, Duration::from_secs(10)))
-        .and_then(|()| sockopt::set_tcp_keepintvl(stream, Duration::from_secs(5)))
-        .and_then(|()| sockopt::set_tcp_keepcnt(stream, 3));
-    if let Err(error) = idle.and_then(|()| sockopt::set_tcp_nodelay(stream, true)) {
-        tracing::debug!(%error, "options of a connection were not set");
     }
 }
 

@@ -10,6 +10,7 @@ mod list;
 mod messages;
 mod placement;
 mod poses;
+mod ros;
 mod stats;
 mod submit;
 mod writes;
@@ -42,6 +43,11 @@ const FIGURES: &[Figure] = &[
     ("poses", "poses of 10 000 robots over 100 streams on one core, against a bare stream", || {
         Box::pin(poses::all())
     }),
+    (
+        "pose",
+        "a robot's pose from rospy's publish to the controller, against a bare subscriber",
+        || Box::pin(ros::pose()),
+    ),
     ("footprint", "RSS and idle CPU of agent and controller", || Box::pin(footprint::all())),
 ];
 

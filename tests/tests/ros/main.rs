@@ -1,3 +1,4 @@
 //! Our ROS 1 client and the agent's poses against Debian's ROS 1: roscore, rospy, rostopic, rosnode.
 
 mod client;
+mod pose;

@@ -77,6 +77,9 @@ fn state(sheet: &mut Sheet, status: &NodeStatus, now: Timestamp) {
         if let Some(stamp) = &pose.stamp {
             text.push_str(&format!(", {} ago", human::age(stamp.0, now)));
         }
+        if let Some(covariance) = &pose.covariance {
+            text.push_str(&format!(", ±{:.2} m", covariance.deviation()));
+        }
         let mood = if pose.localized { Mood::Plain } else { Mood::Bad };
         if !pose.localized {
             text.push_str(" (the robot does not know where it is)");

@@ -172,6 +172,7 @@ fn row(item: Item) -> [Cell; 6] {
         stamp: None,
         source: String::new(),
         localized: item.localized,
+        covariance: None,
     };
     let (place, mood) = match item.localized {
         true => (at.to_string(), Mood::Plain),

@@ -28,6 +28,7 @@ fn pose(x: f64) -> PoseRef<'static> {
         stamp: None,
         source: "mocap",
         localized: true,
+        covariance: None,
     }
 }
 

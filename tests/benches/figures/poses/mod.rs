@@ -5,7 +5,7 @@
 //! what it is offered there.
 
 mod bare;
-mod readers;
+pub(crate) mod readers;
 mod stream;
 
 use std::io::{BufRead as _, BufReader};
