@@ -36,7 +36,7 @@ pub enum MasterState {
 pub(super) async fn run(shared: Arc<Shared>) {
     let mut rounds = 0u32;
     loop {
-        let whole = rounds % WHOLE == 0;
+        let whole = rounds.is_multiple_of(WHOLE);
         let begun = Instant::now();
         let state = match round(&shared, whole).await {
             Ok(()) => MasterState::Registered,

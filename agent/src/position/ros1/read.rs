@@ -20,7 +20,7 @@ const TF: &str = "tf/tfMessage";
 /// What a message says.
 #[derive(Debug)]
 pub(super) enum Read {
-    Said(Kind, Said),
+    Said(Kind, Box<Said>),
     Told(Vec<Told>),
 }
 
@@ -81,8 +81,13 @@ fn stamp(time: Time) -> Option<i64> {
     (!time.is_zero()).then(|| time.nanos())
 }
 
-fn said(header: Header, pose: &Pose, covariance: [f64; 36]) -> Said {
-    Said { frame: header.frame_id, stamp: stamp(header.stamp), pose: transform(pose), covariance }
+fn said(header: Header, pose: &Pose, covariance: [f64; 36]) -> Box<Said> {
+    Box::new(Said {
+        frame: header.frame_id,
+        stamp: stamp(header.stamp),
+        pose: transform(pose),
+        covariance,
+    })
 }
 
 fn transform(pose: &Pose) -> Option<Transform> {
