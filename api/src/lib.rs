@@ -13,6 +13,7 @@
 //! | [`resource`] | CR, SR and AR: what nodes have and tasks ask for |
 //! | [`pose`] | where a robot is, in which map |
 //! | [`phase`], [`condition`] | states as enums |
+//! | [`table`] | objects as rows: the columns of each kind |
 //! | [`wire`] | generated protobuf messages and their conversions; wire types stop there |
 #![deny(missing_docs)]
 
@@ -28,6 +29,7 @@ pub mod pose;
 pub mod quantity;
 pub mod resource;
 pub mod selector;
+pub mod table;
 pub mod validate;
 pub mod wire;
 

@@ -19,6 +19,7 @@
 //! | [`offer`] | which frameworks are shown what, and whose Accept passes |
 //! | [`fairness`] | namespaces' shares, and what their quotas leave of what can be reserved |
 //! | [`quota`] | whether a namespace's quota lets a new task in |
+//! | [`apply`] | whose each field of an object is, and what an object becomes when somebody applies a part of it |
 //! | [`hold`] | why a task is not considered for a place at all |
 //! | [`config`] | what a task gets of ConfigMaps and Secrets |
 //! | [`deadline`] | when a task has been on its node, or has been over, for long enough |
@@ -31,6 +32,7 @@
 //! | [`report`] | typed reasons, with the words people read |
 #![deny(missing_docs)]
 
+pub mod apply;
 pub mod cluster;
 pub mod config;
 pub mod deadline;

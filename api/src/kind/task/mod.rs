@@ -79,6 +79,7 @@ pub struct TaskSpec {
     /// Tasks that must have come so far before an attempt of this one begins, also after a reboot of its node. Until all
     /// have, it is not placed.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    #[schemars(extend("x-kubernetes-list-type" = "map", "x-kubernetes-list-map-keys" = ["task"]))]
     pub depends_on: Vec<depend::DependsOn>,
     /// How long the task may be on its node, seconds from when it was placed; then it is stopped, and has Failed with
     /// the reason DeadlineExceeded. The controller keeps the time: a node without contact is told when it is back.
@@ -239,9 +240,11 @@ pub struct Resources {
     pub pids: Option<u64>,
     /// SR: sensor functions, shared with others.
     #[serde(skip_serializing_if = "Vec::is_empty")]
+    #[schemars(extend("x-kubernetes-list-type" = "set"))]
     pub sensors: Vec<FunctionName>,
     /// AR: actuator functions, for this task alone.
     #[serde(skip_serializing_if = "Vec::is_empty")]
+    #[schemars(extend("x-kubernetes-list-type" = "set"))]
     pub actuators: Vec<FunctionName>,
 }
 
@@ -333,18 +336,21 @@ pub struct ContainerRun {
     pub args: Vec<String>,
     /// Environment.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    #[schemars(extend("x-kubernetes-list-type" = "map", "x-kubernetes-list-map-keys" = ["name"]))]
     pub env: Vec<EnvVar>,
     /// Whole ConfigMaps and Secrets as environment.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub env_from: Vec<EnvFrom>,
     /// ConfigMaps and Secrets as files.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    #[schemars(extend("x-kubernetes-list-type" = "map", "x-kubernetes-list-map-keys" = ["mountPath"]))]
     pub files: Vec<Files>,
     /// Working directory in the container.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub working_dir: Option<String>,
     /// Directories of the node that the container sees.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    #[schemars(extend("x-kubernetes-list-type" = "map", "x-kubernetes-list-map-keys" = ["mountPath"]))]
     pub mounts: Vec<Mount>,
     /// The container's network.
     #[serde(default)]
@@ -366,12 +372,14 @@ pub struct ProcessRun {
     pub args: Vec<String>,
     /// Environment, beside the agent's PATH and the MUSTER_ variables.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    #[schemars(extend("x-kubernetes-list-type" = "map", "x-kubernetes-list-map-keys" = ["name"]))]
     pub env: Vec<EnvVar>,
     /// Whole ConfigMaps and Secrets as environment.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub env_from: Vec<EnvFrom>,
     /// ConfigMaps and Secrets as files.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    #[schemars(extend("x-kubernetes-list-type" = "map", "x-kubernetes-list-map-keys" = ["mountPath"]))]
     pub files: Vec<Files>,
     /// Working directory; none: a directory of the task's own.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -644,6 +652,7 @@ pub(super) const INFO: KindInfo = KindInfo {
     namespaced: true,
     has_status: true,
     selectable: &["status.phase", "status.node", "spec.placement.node", "spec.priority"],
+    schema: |g| g.subschema_for::<Task>(),
     admit_body: |object, violations| admit_spec::<TaskSpec>(object, violations, rules::rules),
     admit_change: rules::change_rules,
 };

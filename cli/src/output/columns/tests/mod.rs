@@ -1,0 +1,7 @@
+//! How the tables of each kind look.
+
+mod framework;
+mod node;
+mod quota;
+mod task;
+mod taskset;
