@@ -24,6 +24,7 @@
 //! | [`config`] | what a task gets of ConfigMaps and Secrets |
 //! | [`deadline`] | when a task has been on its node, or has been over, for long enough |
 //! | [`deletion`] | when an object is to be gone that somebody deletes |
+//! | [`project`] | tasks and nodes as Kubernetes' Pods and Nodes |
 //! | [`recent`] | one allocation for what many nodes or tasks have in common |
 //! | [`node_health`] | when a node counts as lost |
 //! | [`taskset`] | which tasks of a TaskSet begin, end and follow each other |
@@ -46,6 +47,7 @@ pub mod node_health;
 pub mod offer;
 pub mod poses;
 pub mod preempt;
+pub mod project;
 pub mod quota;
 pub mod recent;
 pub mod report;

@@ -167,8 +167,7 @@ impl Failure {
 
     /// Says which object it is about.
     pub(crate) fn about(mut self, entry: &Entry, name: &str) -> Self {
-        self.details =
-            json!({"name": name, "group": entry.info.group, "kind": entry.resource.as_str()});
+        self.details = json!({"name": name, "group": entry.info.group, "kind": entry.info.plural});
         self
     }
 
@@ -178,6 +177,24 @@ impl Failure {
             self.details = json!({});
         }
         self.details["causes"] = json!([{"reason": reason, "message": message, "field": field}]);
+        self
+    }
+
+    /// Says all its causes.
+    pub(crate) fn with_causes(mut self, causes: Vec<Value>) -> Self {
+        if self.details.is_null() {
+            self.details = json!({});
+        }
+        self.details["causes"] = causes.into();
+        self
+    }
+
+    /// Says when it is worth to ask again.
+    pub(crate) fn retry_after(mut self, seconds: u64) -> Self {
+        if self.details.is_null() {
+            self.details = json!({});
+        }
+        self.details["retryAfterSeconds"] = seconds.into();
         self
     }
 

@@ -9,7 +9,8 @@ mod tests;
 
 use std::collections::BTreeMap;
 
-use k8s_openapi::apimachinery::pkg::apis::meta::v1::MicroTime;
+use jiff::Timestamp;
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::{MicroTime, Time};
 use kube::CustomResource;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -18,6 +19,7 @@ pub use config::{EnvFrom, EnvSource, Files};
 
 use super::node::{NodeKind, Taint, TaintEffect};
 use super::{KindInfo, admit_spec};
+use crate::condition::{self, Condition};
 use crate::duration::Span;
 use crate::id::Epoch;
 use crate::name::FunctionName;
@@ -498,7 +500,7 @@ impl TaskSpec {
 
 /// What has become of a task.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(rename_all = "camelCase", default)]
+#[serde(rename_all = "camelCase", default, remote = "Self")]
 pub struct TaskStatus {
     /// Where it is in its life.
     pub phase: TaskPhase,
@@ -556,9 +558,62 @@ pub struct TaskStatus {
     /// Number of the agent's newest report that is in here: reports are applied once.
     #[serde(skip_serializing_if = "is_zero")]
     pub report_sequence: u64,
+    /// `Placed`, `Ready`; of a task that has ended `Complete` or `Failed`. They follow from the other fields: they are
+    /// written whenever those are, and not read back (see [`TaskStatus::conditions`]).
+    #[serde(skip_deserializing, skip_serializing_if = "Vec::is_empty")]
+    #[schemars(extend("x-kubernetes-list-type" = "map", "x-kubernetes-list-map-keys" = ["type"]))]
+    pub conditions: Vec<Condition>,
+}
+
+impl Serialize for TaskStatus {
+    fn serialize<S: serde::Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        // The derived function, with what follows from the rest.
+        let shown = TaskStatus { conditions: self.conditions(), ..self.clone() };
+        TaskStatus::serialize(&shown, serializer)
+    }
+}
+
+impl<'de> Deserialize<'de> for TaskStatus {
+    fn deserialize<D: serde::Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        TaskStatus::deserialize(deserializer)
+    }
 }
 
 impl TaskStatus {
+    /// What the status says, as conditions: for clients that wait for these.
+    #[must_use]
+    pub fn conditions(&self) -> Vec<Condition> {
+        let since = |time: &Option<MicroTime>| {
+            time.as_ref().map(|t| Time(Timestamp::from_second(t.0.as_second()).unwrap_or(t.0)))
+        };
+        let of = |r#type: &str, holds: bool, reason: &str, time: &Option<MicroTime>| Condition {
+            last_transition_time: since(time),
+            ..Condition::new(r#type, holds, reason, "")
+        };
+        let ready = self.is_ready();
+        let reason =
+            if ready || !self.reason.is_empty() { &*self.reason } else { self.phase.as_str() };
+        let times = if ready {
+            [&self.ready_at, &self.started_at]
+        } else {
+            [&self.finished_at, &self.bound_at]
+        };
+        let [first, second] = times;
+        let time = if first.is_some() { first } else { second };
+        let mut conditions = vec![
+            of(PLACED, self.node.is_some(), "", &self.bound_at),
+            of(condition::READY, ready, reason, time),
+        ];
+        match self.phase {
+            TaskPhase::Succeeded => {
+                conditions.push(of(COMPLETE, true, &self.reason, &self.finished_at))
+            }
+            TaskPhase::Failed => conditions.push(of(FAILED, true, &self.reason, &self.finished_at)),
+            _ => {}
+        }
+        conditions
+    }
+
     /// Whether the task serves: it runs, and its probes, if it has some, say so.
     #[must_use]
     pub fn is_ready(&self) -> bool {
@@ -591,6 +646,13 @@ pub struct StopOrder {
     /// When it was given.
     pub at: MicroTime,
 }
+
+/// Condition of a task that is on a node.
+pub const PLACED: &str = "Placed";
+/// Condition of a task that has ended with success.
+pub const COMPLETE: &str = "Complete";
+/// Condition of a task that has ended without success.
+pub const FAILED: &str = "Failed";
 
 /// Reason of a task that waits until others have ended to make room for it.
 pub const PREEMPTING: &str = "Preempting";
