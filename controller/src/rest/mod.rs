@@ -5,7 +5,7 @@
 //! | file | answers |
 //! |---|---|
 //! | [`path`] | URL + method → target and verb |
-//! | `query`, `body` | parameters; JSON bodies with their limit |
+//! | `query`, `body`, `protobuf` | parameters; bodies with their limit |
 //! | `registry` | what is served: one entry a kind |
 //! | `discovery`, `openapi` | /api, /apis, resource lists, /version; schemas of everything |
 //! | `form` | whole objects, their metadata, or tables |
@@ -48,6 +48,7 @@ mod owners;
 mod patch;
 pub mod path;
 mod poses;
+mod protobuf;
 mod query;
 mod question;
 pub(crate) mod registry;
@@ -68,6 +69,7 @@ use axum::extract::State;
 use axum::response::{IntoResponse as _, Response};
 use http::{HeaderValue, Request, StatusCode, header};
 use serde_json::Value;
+use tokio::sync::Semaphore;
 
 use crate::auth::{Identity, Permission, permits};
 use crate::context::Context;
@@ -78,6 +80,10 @@ use registry::View;
 
 /// An answer that takes longer than this is a fault of ours, and the client should hear of it.
 const TIMEOUT: Duration = Duration::from_secs(60);
+/// Requests that are worked on at once, without those that last (watches, logs). A client that finds them all taken is
+/// told to come back: a queue would only make everybody late. One core answers thousands in a second.
+const AT_ONCE: usize = 512;
+static PLACES: Semaphore = Semaphore::const_new(AT_ONCE);
 
 /// Bytes, ready to be an answer.
 pub(crate) type Answer = Result<Response, Failure>;
@@ -110,9 +116,12 @@ async fn handle(State(context): State<Arc<Context>>, request: Request<Body>) -> 
         Err(failure) => Err(failure),
         Ok((verb, target)) if long => dispatch(context, verb, target, request).await,
         Ok((verb, target)) => {
-            match tokio::time::timeout(TIMEOUT, dispatch(context, verb, target, request)).await {
-                Ok(answer) => answer,
-                Err(_) => Err(Failure::timeout("the request was not answered in time")),
+            // Whether it lives is asked when it is busy, above all.
+            let place = PLACES.try_acquire();
+            if place.is_err() && !matches!(target, Target::Health(_)) {
+                Err(Failure::too_many())
+            } else {
+                within(TIMEOUT, dispatch(context, verb, target, request)).await
             }
         }
     };
@@ -126,6 +135,14 @@ async fn handle(State(context): State<Arc<Context>>, request: Request<Body>) -> 
             .record(start.elapsed());
     }
     response
+}
+
+/// The answer, or that there was none in time.
+async fn within(limit: Duration, answer: impl Future<Output = Answer>) -> Answer {
+    match tokio::time::timeout(limit, answer).await {
+        Ok(answer) => answer,
+        Err(_) => Err(Failure::timeout("the request was not answered in time")),
+    }
 }
 
 async fn dispatch(

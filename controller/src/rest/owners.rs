@@ -180,27 +180,37 @@ pub(super) fn applied(
     Ok(object)
 }
 
-/// Who owns an object of which nobody has kept account.
+/// Who owns an object of which nobody has kept account: kubectl what it says that it applied, else somebody all of it.
 fn first(schema: &Value, live: &Value, owned: &Value) -> Owners {
-    let name = match live["metadata"]["annotations"].get(LAST_APPLIED) {
-        Some(_) => "kubectl-client-side-apply",
-        None => "before-first-apply",
+    let (name, fields) = match last_applied(live) {
+        Some(last) => {
+            let there = apply::all_of(schema, owned);
+            let said = apply::all_of(schema, &ownable(&last));
+            ("kubectl-client-side-apply", said.intersection(&there).cloned().collect())
+        }
+        None => {
+            let mut said = owned.clone();
+            if let Some(fields) = said.as_object_mut() {
+                fields.remove("status");
+            }
+            ("before-first-apply", apply::all_of(schema, &said))
+        }
     };
     let manager =
         Manager { name: name.to_owned(), operation: Operation::Update, subresource: String::new() };
     let time = live["metadata"]["creationTimestamp"].as_str().unwrap_or_default().to_owned();
-    let mut said = owned.clone();
-    if let Some(fields) = said.as_object_mut() {
-        fields.remove("status");
-    }
-    Owners::from([(manager, Owned { fields: apply::all_of(schema, &said), time })])
+    Owners::from([(manager, Owned { fields, time })])
+}
+
+/// What kubectl says that it applied itself.
+fn last_applied(live: &Value) -> Option<Value> {
+    let last = live["metadata"]["annotations"].get(LAST_APPLIED)?.as_str()?;
+    serde_json::from_str(last).ok()
 }
 
 /// Whether all of this is what kubectl says that it applied itself.
 fn all_kubectls(schema: &Value, live: &Value, conflicts: &[Conflict]) -> bool {
-    let last = live["metadata"]["annotations"][LAST_APPLIED].as_str();
-    let last = last.and_then(|text| serde_json::from_str::<Value>(text).ok());
-    let Some(last) = last else { return false };
+    let Some(last) = last_applied(live) else { return false };
     let fields = apply::all_of(schema, &ownable(&last));
     conflicts.iter().all(|conflict| {
         fields.contains(&conflict.path) || conflict.path.to_string().contains("last-applied")

@@ -135,11 +135,20 @@ fn read(media: &str, bytes: &Bytes) -> Result<Change, Failure> {
     Ok(Change::Json(patch))
 }
 
+/// Whether a JSON patch is for a version, which it tests or sets.
+fn names_version(patch: &Change) -> bool {
+    const VERSION: &str = "/metadata/resourceVersion";
+    match patch {
+        Change::Json(patch) => patch.0.iter().any(|operation| operation.path().as_str() == VERSION),
+        Change::Merge(_) | Change::Strategic(_) => false,
+    }
+}
+
 /// What an object becomes by a patch.
 pub(super) fn apply(patch: &Change, present: &Value) -> Result<Value, Failure> {
     let mut object = present.clone();
     // The patch says which version it is for, or none; what is there now is not the client's word.
-    if let Some(metadata) = object["metadata"].as_object_mut() {
+    if let Some(metadata) = object["metadata"].as_object_mut().filter(|_| !names_version(patch)) {
         metadata.remove("resourceVersion");
     }
     match patch {

@@ -1,9 +1,9 @@
 //! What may I do, and who am I: `SelfSubjectAccessReview`, `SelfSubjectRulesReview`, `SelfSubjectReview`.
 //!
-//! kubectl sends these in protobuf; of that only what they say of the question is read.
+//! The answers are those of the one function that requests are held to.
 
-use http::{HeaderMap, Method, StatusCode};
-use prost::Message;
+use http::{Method, StatusCode};
+use serde::Deserialize as _;
 use serde_json::{Value, json};
 
 use super::path::{Object, Target, Verb};
@@ -21,64 +21,42 @@ pub(crate) enum Review {
     Subject,
 }
 
-const PROTOBUF: &str = "application/vnd.kubernetes.protobuf";
-/// How an object in protobuf begins.
-const MAGIC: &[u8] = b"k8s\0";
-
-/// `runtime.Unknown`: an object and what it is.
-#[derive(Clone, PartialEq, Message)]
-struct Unknown {
-    #[prost(bytes = "vec", optional, tag = "2")]
-    raw: Option<Vec<u8>>,
-}
-
-#[derive(Clone, PartialEq, Message)]
-struct AccessReview {
-    #[prost(message, optional, tag = "2")]
-    spec: Option<AccessSpec>,
-}
-
-#[derive(Clone, PartialEq, Message)]
+#[derive(Debug, Clone, Default, PartialEq, Eq, serde::Deserialize)]
+#[serde(rename_all = "camelCase", default)]
 struct AccessSpec {
-    #[prost(message, optional, tag = "1")]
-    resource: Option<ResourceAttributes>,
-    #[prost(message, optional, tag = "2")]
-    other: Option<OtherAttributes>,
+    resource_attributes: Option<ResourceAttributes>,
+    non_resource_attributes: Option<OtherAttributes>,
 }
 
-#[derive(Clone, PartialEq, Message, serde::Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Eq, serde::Deserialize)]
 #[serde(default)]
 struct ResourceAttributes {
-    #[prost(string, tag = "1")]
     namespace: String,
-    #[prost(string, tag = "2")]
     verb: String,
-    #[prost(string, tag = "3")]
     group: String,
-    #[prost(string, tag = "5")]
     resource: String,
-    #[prost(string, tag = "6")]
     subresource: String,
-    #[prost(string, tag = "7")]
     name: String,
 }
 
-#[derive(Clone, PartialEq, Message, serde::Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Eq, serde::Deserialize)]
 #[serde(default)]
 struct OtherAttributes {
-    #[prost(string, tag = "1")]
     path: String,
-    #[prost(string, tag = "2")]
     verb: String,
 }
 
 pub(super) async fn answer(call: Call, review: Review) -> Answer {
     let Call { identity, request, .. } = call;
     let (parts, body) = request.into_parts();
-    let bytes = body::bytes(body).await?;
+    let body = body::optional_json(&parts.headers, body).await?;
     let answer = match review {
         Review::Access => {
-            let spec = access(&parts.headers, &bytes)?;
+            let spec = match &body["spec"] {
+                Value::Null => AccessSpec::default(),
+                spec => AccessSpec::deserialize(spec)
+                    .map_err(|error| Failure::bad_request(format!("spec: {error}")))?,
+            };
             let (allowed, asked) = may(&identity, &spec)?;
             json!({
                 "kind": "SelfSubjectAccessReview", "apiVersion": "authorization.k8s.io/v1",
@@ -98,39 +76,10 @@ pub(super) async fn answer(call: Call, review: Review) -> Answer {
     Ok(super::json(StatusCode::CREATED, &answer))
 }
 
-/// The question in either form.
-fn access(headers: &HeaderMap, bytes: &[u8]) -> Result<AccessSpec, Failure> {
-    let media = body::media_type(headers);
-    if media == PROTOBUF {
-        let bad = || Failure::bad_request("the body is not a SelfSubjectAccessReview in protobuf");
-        let unknown = bytes.strip_prefix(MAGIC).ok_or_else(bad)?;
-        let raw = Unknown::decode(unknown).map_err(|_| bad())?.raw.unwrap_or_default();
-        let review = AccessReview::decode(&*raw).map_err(|_| bad())?;
-        return Ok(review.spec.unwrap_or_default());
-    }
-    if !matches!(media.as_str(), "" | "application/json") {
-        return Err(body::unsupported(&media, &format!("application/json, {PROTOBUF}")));
-    }
-    let review = body::parse(bytes)?;
-    let spec = &review["spec"];
-    let read = |error: serde_json::Error| Failure::bad_request(format!("spec: {error}"));
-    let optional = |value: &Value| (!value.is_null()).then(|| value.clone());
-    Ok(AccessSpec {
-        resource: optional(&spec["resourceAttributes"])
-            .map(serde_json::from_value)
-            .transpose()
-            .map_err(read)?,
-        other: optional(&spec["nonResourceAttributes"])
-            .map(serde_json::from_value)
-            .transpose()
-            .map_err(read)?,
-    })
-}
-
 /// Whether they may, by the rules that requests are held to; and the question as it was understood.
 fn may(identity: &Identity, spec: &AccessSpec) -> Result<(bool, Value), Failure> {
     let all = matches!(identity, Identity::Admin { .. });
-    match (&spec.resource, &spec.other) {
+    match (&spec.resource_attributes, &spec.non_resource_attributes) {
         (Some(asked), None) => {
             let verb = Verb::named(&asked.verb);
             let entry = registry::find(&asked.group, &asked.resource);
@@ -198,24 +147,19 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_question_in_protobuf_is_read() {
-        let resource = ResourceAttributes {
-            verb: "create".into(),
-            group: "muster.dev".into(),
-            resource: "tasks".into(),
-            ..ResourceAttributes::default()
+    fn the_answer_is_what_a_request_would_be_told() {
+        let may = |identity: &Identity, spec: Value| {
+            may(identity, &AccessSpec::deserialize(&spec).unwrap()).map(|(allowed, _)| allowed).ok()
         };
-        let spec = AccessSpec { resource: Some(resource), other: None };
-        let raw = AccessReview { spec: Some(spec.clone()) }.encode_to_vec();
-        let mut bytes = MAGIC.to_vec();
-        Unknown { raw: Some(raw) }.encode(&mut bytes).unwrap();
-        let headers =
-            HeaderMap::from_iter([(http::header::CONTENT_TYPE, PROTOBUF.parse().unwrap())]);
-        assert_eq!(access(&headers, &bytes).unwrap(), spec);
-        assert!(access(&headers, b"{}").is_err());
+        let create = json!({"resourceAttributes": {"verb": "create", "group": "muster.dev", "resource": "tasks"}});
+        let own = json!({"resourceAttributes": {"verb": "get", "group": "muster.dev", "resource": "nodes", "name": "r1"}});
+        let version = json!({"nonResourceAttributes": {"verb": "get", "path": "/version"}});
         let admin = Identity::Admin { name: "a".into() };
-        assert!(may(&admin, &spec).unwrap().0);
-        let user = Identity::User { name: "u".into(), groups: Vec::new() };
-        assert!(!may(&user, &spec).unwrap().0);
+        let node = Identity::Node { name: "r1".into(), key: String::new() };
+        assert_eq!(may(&admin, create.clone()), Some(true));
+        assert_eq!(may(&node, create), Some(false));
+        assert_eq!(may(&node, own), Some(true));
+        assert_eq!(may(&node, version), Some(true));
+        assert_eq!(may(&admin, json!({})), None);
     }
 }

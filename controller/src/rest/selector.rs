@@ -1,7 +1,7 @@
 //! Label and field selectors of a request.
 
 use muster_api::selector::{FieldSelector, LabelSelector, Labels};
-use serde::Deserialize;
+use serde::Deserialize as _;
 
 use super::failure::Failure;
 use super::query::Query;
@@ -17,17 +17,6 @@ pub(super) struct Selection {
     /// Requirements on name and namespace, which need no look into the object.
     place: FieldSelector,
     fields: FieldSelector,
-}
-
-#[derive(Deserialize)]
-struct Labelled {
-    metadata: LabelledMetadata,
-}
-
-#[derive(Deserialize)]
-struct LabelledMetadata {
-    #[serde(default)]
-    labels: Option<Labels>,
 }
 
 impl Selection {
@@ -95,8 +84,7 @@ impl Selection {
             let labels = Labels::deserialize(&object["metadata"]["labels"]);
             return self.labels.matches(&labels.unwrap_or_default());
         }
-        let labels = stored.parse::<Labelled>().ok().and_then(|object| object.metadata.labels);
-        self.labels.matches(&labels.unwrap_or_default())
+        self.labels.matches(stored.labels())
     }
 
     fn fields_match(&self, stored: &Stored) -> bool {

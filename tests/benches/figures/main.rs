@@ -12,6 +12,7 @@ mod placement;
 mod poses;
 mod stats;
 mod submit;
+mod watchers;
 mod writes;
 
 use std::process::ExitCode;
@@ -38,6 +39,9 @@ const FIGURES: &[Figure] = &[
     }),
     ("list", "list of 10 000 nodes, against encoding it and a loopback write", || {
         Box::pin(list::nodes())
+    }),
+    ("watchers", "1 020 watchers, most on 1/100 of the objects, under 500 writes/s", || {
+        Box::pin(watchers::all())
     }),
     ("poses", "poses of 10 000 robots over 100 streams on one core, against a bare stream", || {
         Box::pin(poses::all())

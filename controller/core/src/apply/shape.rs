@@ -188,8 +188,8 @@ fn take(schema: &Value, value: &mut Value, steps: &[Step]) {
                 take(without_null(schema.get("items").unwrap_or(NO_SCHEMA)), element, rest);
             }
         }
-        (Step::Element(wanted), Value::Array(elements)) => {
-            elements.retain(|element| element.to_string() != *wanted);
+        (Step::Element(_), Value::Array(elements)) => {
+            elements.retain(|element| Step::Element(element.to_string()) != *first);
         }
         _ => {}
     }

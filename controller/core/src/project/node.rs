@@ -1,5 +1,7 @@
 //! A Node of ours as a core Node, and back: cordon, labels, annotations and taints are written through it.
 
+use std::net::{IpAddr, SocketAddr};
+
 use muster_api::kind::node::{Node, NodeKind, NodeStatus};
 use serde_json::{Map, Value, json};
 
@@ -60,9 +62,15 @@ fn node_status(object: &Value, node: &Node, status: &NodeStatus) -> Value {
     let mut addresses = vec![json!({"type": "Hostname", "address": node.metadata.name})];
     if !status.address.is_empty() {
         // The port of the agent's connection is nobody's to call.
-        let host = status.address.parse::<std::net::SocketAddr>();
-        let host = host.map_or_else(|_| status.address.clone(), |address| address.ip().to_string());
-        addresses.insert(0, json!({"type": "InternalIP", "address": host}));
+        let socket = status.address.parse::<SocketAddr>().map(|address| address.ip());
+        let address = socket.or_else(|_| status.address.parse::<IpAddr>());
+        addresses.insert(
+            0,
+            match address {
+                Ok(ip) => json!({"type": "InternalIP", "address": ip.to_string()}),
+                Err(_) => json!({"type": "InternalDNS", "address": status.address}),
+            },
+        );
     }
     json!({
         "capacity": resources(&status.capacity),

@@ -135,7 +135,7 @@ fn container_status(object: &Value, spec: &TaskSpec, status: &TaskStatus) -> Val
     let terminated = || {
         let mut end = json!({
             // What a shell says of a signal; kubectl knows nothing else.
-            "exitCode": status.exit_code.or(status.signal.map(|s| 128 + s)).unwrap_or_default(),
+            "exitCode": status.exit_code.or_else(|| status.signal.map(|s| 128 + s)).unwrap_or_default(),
             "reason": match (status.phase, status.reason.as_str()) {
                 (TaskPhase::Succeeded, _) => "Completed",
                 (_, "") => "Error",

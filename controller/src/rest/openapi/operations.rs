@@ -111,22 +111,16 @@ impl Maker<'_> {
         ];
         let select = [query("labelSelector", "string"), query("fieldSelector", "string")];
         let (method, action, parameters, body, answer) = match verb {
-            Verb::Get => ("get", "get", Vec::new(), None, object.clone()),
+            Verb::Get => ("get", "get", Vec::new(), None, object),
             Verb::List | Verb::Watch => {
-                let more = [
-                    query("limit", "integer"),
-                    query("continue", "string"),
-                    query("resourceVersion", "string"),
-                    query("timeoutSeconds", "integer"),
-                    query("watch", "boolean"),
-                ];
+                let more = [query("limit", "integer"), query("continue", "string")];
                 ("get", "list", select.into_iter().chain(more).collect(), None, list)
             }
-            Verb::Create => ("post", "post", write.to_vec(), Some(self.whole()), object.clone()),
-            Verb::Update => ("put", "put", write.to_vec(), Some(self.whole()), object.clone()),
+            Verb::Create => ("post", "post", write.to_vec(), Some(self.whole()), object),
+            Verb::Update => ("put", "put", write.to_vec(), Some(self.whole()), object),
             Verb::Patch => {
                 let parameters = write.into_iter().chain([query("force", "boolean")]).collect();
-                ("patch", "patch", parameters, Some(self.patches()), object.clone())
+                ("patch", "patch", parameters, Some(self.patches()), object)
             }
             Verb::Delete => (
                 "delete",
