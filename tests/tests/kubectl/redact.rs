@@ -41,8 +41,8 @@ fn is_age(word: &str) -> bool {
             _ => return false,
         }
     }
-    // `100m` of cpu is no age.
-    units > 0 && digits == 0 && !word.ends_with('m')
+    // `100m` of cpu is no age; `2m` is.
+    units > 0 && digits == 0 && (!word.ends_with('m') || word.len() <= 2)
 }
 
 fn is_uid(word: &str) -> bool {
