@@ -14,6 +14,7 @@
 //! | [`pose`] | where a robot is, in which map |
 //! | [`direct`] | messages that do not pass the controller: frames, tickets, which way each goes |
 //! | [`phase`], [`condition`] | states as enums |
+//! | [`table`] | objects as rows: the columns of each kind |
 //! | [`wire`] | generated protobuf messages and their conversions; wire types stop there |
 #![deny(missing_docs)]
 
@@ -30,6 +31,7 @@ pub mod pose;
 pub mod quantity;
 pub mod resource;
 pub mod selector;
+pub mod table;
 pub mod validate;
 pub mod wire;
 

@@ -61,6 +61,18 @@ impl Identity {
         }
     }
 
+    /// The groups that the certificate names, as Kubernetes would show them.
+    #[must_use]
+    pub fn groups(&self) -> Vec<String> {
+        let own = match self {
+            Self::Admin { .. } => vec![ADMINS.to_owned()],
+            Self::Node { .. } => vec![NODES.to_owned()],
+            Self::User { groups, .. } => groups.clone(),
+            Self::Anonymous => return vec!["system:unauthenticated".to_owned()],
+        };
+        own.into_iter().chain(["system:authenticated".to_owned()]).collect()
+    }
+
     /// The name for logs and for answers.
     #[must_use]
     pub fn name(&self) -> String {
@@ -98,11 +110,11 @@ pub(crate) fn permits(identity: &Identity, verb: Verb, target: &Target) -> Permi
             {
                 Permission::Granted
             }
-            Target::Discovery(_) => Permission::Granted,
+            Target::Discovery(_) | Target::OpenApi(_) | Target::Review(_) => Permission::Granted,
             _ => Permission::Denied,
         },
         Identity::User { .. } => match target {
-            Target::Discovery(_) => Permission::Granted,
+            Target::Discovery(_) | Target::OpenApi(_) | Target::Review(_) => Permission::Granted,
             _ => Permission::Denied,
         },
     }

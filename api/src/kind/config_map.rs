@@ -45,6 +45,7 @@ pub(super) const INFO: KindInfo = KindInfo {
     short_names: &["cm"],
     namespaced: true,
     has_status: false,
+    schema: |g| g.subschema_for::<ConfigMap>(),
     selectable: &[],
     admit_body: admit,
     admit_change: |old, new, violations| {

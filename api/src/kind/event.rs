@@ -13,6 +13,7 @@ pub(super) const INFO: KindInfo = KindInfo {
     short_names: &["ev"],
     namespaced: true,
     has_status: false,
+    schema: |g| g.subschema_for::<Event>(),
     selectable: &[
         "involvedObject.kind",
         "involvedObject.name",

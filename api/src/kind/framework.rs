@@ -168,6 +168,7 @@ pub(super) const INFO: KindInfo = KindInfo {
     namespaced: true,
     has_status: true,
     selectable: &["status.connected"],
+    schema: |g| g.subschema_for::<Framework>(),
     admit_body: |object, violations| admit_spec::<FrameworkSpec>(object, violations, rules),
     admit_change: any_change,
 };

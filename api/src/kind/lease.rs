@@ -86,6 +86,7 @@ pub(super) const INFO: KindInfo = KindInfo {
     namespaced: false,
     has_status: true,
     selectable: &["spec.node", "spec.group"],
+    schema: |g| g.subschema_for::<Lease>(),
     admit_body: |object, violations| admit_spec::<LeaseSpec>(object, violations, rules),
     admit_change: any_change,
 };

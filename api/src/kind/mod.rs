@@ -9,6 +9,7 @@ pub mod keyed;
 pub mod lease;
 pub mod namespace;
 pub mod node;
+pub mod projected;
 pub mod quota;
 pub mod secret;
 pub mod task;
@@ -19,8 +20,8 @@ use std::any::TypeId;
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError};
 
-use schemars::JsonSchema;
-use schemars::generate::SchemaSettings;
+use schemars::generate::{SchemaGenerator, SchemaSettings};
+use schemars::{JsonSchema, Schema};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 use serde_json::Value;
@@ -50,6 +51,8 @@ pub struct KindInfo {
     pub has_status: bool,
     /// Dotted field paths that a field selector may use, beside `metadata.name` and `metadata.namespace`.
     pub selectable: &'static [&'static str],
+    /// The schema of the whole object.
+    schema: fn(&mut SchemaGenerator) -> Schema,
     /// Checks the body of an object (all but metadata) and fills in defaults.
     admit_body: fn(&mut Value, &mut Violations),
     /// Checks that `new` may follow `old`.
@@ -65,6 +68,35 @@ impl KindInfo {
         } else {
             format!("{}/{}", self.group, self.version)
         }
+    }
+}
+
+impl KindInfo {
+    /// The schema of a whole object; what it refers to is left in the generator. Muster's own kinds do not say what
+    /// `apiVersion`, `kind` and `metadata` are.
+    pub fn schema(&self, generator: &mut SchemaGenerator) -> Schema {
+        (self.schema)(generator)
+    }
+
+    /// The same with everything inlined, made once a kind: how the parts of an object are owned and merged.
+    #[must_use]
+    pub fn fields(&self) -> Arc<Value> {
+        static MADE: Mutex<BTreeMap<(&str, &str), Arc<Value>>> = Mutex::new(BTreeMap::new());
+        let make = || {
+            let settings = SchemaSettings::draft2020_12().with(|s| s.inline_subschemas = true);
+            let mut fields = self.schema(&mut settings.into_generator()).to_value();
+            let metadata =
+                schema_of::<k8s_openapi::apimachinery::pkg::apis::meta::v1::ObjectMeta>();
+            let mut metadata = Value::clone(&metadata);
+            metadata["properties"]["finalizers"]["x-kubernetes-list-type"] = "set".into();
+            metadata["properties"]["ownerReferences"]["x-kubernetes-list-type"] = "map".into();
+            metadata["properties"]["ownerReferences"]["x-kubernetes-list-map-keys"] =
+                serde_json::json!(["uid"]);
+            fields["properties"]["metadata"] = metadata;
+            Arc::new(fields)
+        };
+        let mut made = MADE.lock().unwrap_or_else(PoisonError::into_inner);
+        Arc::clone(made.entry((self.group, self.kind)).or_insert_with(make))
     }
 }
 

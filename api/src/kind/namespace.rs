@@ -16,6 +16,7 @@ pub(super) const INFO: KindInfo = KindInfo {
     short_names: &["ns"],
     namespaced: false,
     has_status: true,
+    schema: |g| g.subschema_for::<Namespace>(),
     selectable: &["status.phase"],
     admit_body: admit_core::<Namespace>,
     admit_change: any_change,

@@ -211,6 +211,7 @@ pub(super) const INFO: KindInfo = KindInfo {
     short_names: &["qu"],
     namespaced: true,
     has_status: true,
+    schema: |g| g.subschema_for::<Quota>(),
     selectable: &[],
     admit_body,
     admit_change: any_change,

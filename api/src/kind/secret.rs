@@ -120,6 +120,7 @@ pub(super) const INFO: KindInfo = KindInfo {
     short_names: &[],
     namespaced: true,
     has_status: false,
+    schema: |g| g.subschema_for::<Secret>(),
     selectable: &["type"],
     admit_body: admit,
     admit_change,

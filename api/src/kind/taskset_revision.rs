@@ -48,6 +48,7 @@ pub(super) const INFO: KindInfo = KindInfo {
     namespaced: true,
     has_status: false,
     selectable: &[],
+    schema: |g| g.subschema_for::<TaskSetRevision>(),
     admit_body: |object, violations| {
         admit_spec::<TaskSetRevisionSpec>(object, violations, |_, _| {});
     },

@@ -3,17 +3,17 @@
 //! | module | holds |
 //! |---|---|
 //! | [`style`] | colours by meaning |
-//! | [`human`] | ages, amounts, counts |
 //! | [`table`], [`sheet`] | layouts: rows; fields under headings |
-//! | [`columns`] | the columns of each kind, one file a kind |
+//! | [`columns`] | objects of a kind as rows |
 //! | [`objects`] | objects in the format that `-o` asks for |
 //! | [`progress`] | spinners while waiting |
 
 pub(crate) mod columns;
-pub(crate) mod human;
 pub(crate) mod objects;
 pub(crate) mod progress;
 pub(crate) mod sheet;
 pub(crate) mod style;
 pub(crate) mod table;
 pub(crate) mod ui;
+
+pub(crate) use muster_api::table::human;

@@ -3,21 +3,7 @@
 use std::fmt::Display;
 
 use anstyle::{AnsiColor, Style};
-
-/// What a piece of text means to the reader.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub(crate) enum Mood {
-    #[default]
-    Plain,
-    /// As it should be.
-    Good,
-    /// Waits, or needs somebody to look.
-    Warn,
-    /// Wrong.
-    Bad,
-    /// Less important.
-    Dim,
-}
+pub(crate) use muster_api::table::Mood;
 
 /// One style; plain by default.
 #[derive(Debug, Clone, Copy, Default)]

@@ -4,38 +4,9 @@
 use comfy_table::presets::NOTHING;
 use comfy_table::{ColumnConstraint, Width};
 
-use super::human;
+pub(crate) use muster_api::table::Cell;
+
 use super::style::{Mood, Styles};
-
-/// A cell.
-#[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub(crate) struct Cell {
-    text: String,
-    mood: Mood,
-}
-
-impl Cell {
-    /// A cell in a mood. Control characters are made harmless, no text is `-`.
-    pub(crate) fn new(text: impl AsRef<str>, mood: Mood) -> Self {
-        Cell { text: human::or_dash(text.as_ref()), mood }
-    }
-
-    /// The text.
-    pub(crate) fn text(&self) -> &str {
-        &self.text
-    }
-
-    /// The mood.
-    pub(crate) fn mood(&self) -> Mood {
-        self.mood
-    }
-}
-
-impl<T: AsRef<str>> From<T> for Cell {
-    fn from(text: T) -> Self {
-        Cell::new(text, Mood::Plain)
-    }
-}
 
 /// Zero-width operators that stand for a mood's begin and end while widths are computed. They mean
 /// nothing outside mathematics, and [`Table::push`] drops them from data.
@@ -71,9 +42,10 @@ impl Table {
 
     /// Adds a row.
     pub(crate) fn push(&mut self, row: impl IntoIterator<Item = impl Into<Cell>>) {
-        let clean = |cell: Cell| Cell {
-            text: cell.text.chars().filter(|c| !MARKS.iter().any(|(m, _)| m == c)).collect(),
-            ..cell
+        let clean = |cell: Cell| {
+            let text: String =
+                cell.text().chars().filter(|c| !MARKS.iter().any(|(m, _)| m == c)).collect();
+            Cell::new(text, cell.mood())
         };
         self.rows.push(row.into_iter().map(|c| clean(c.into())).collect());
     }
@@ -110,9 +82,9 @@ impl Table {
             table.set_header(&self.head);
         }
         for row in &self.rows {
-            table.add_row(row.iter().map(|cell| match mark(cell.mood) {
-                Some(mark) => format!("{mark}{}{mark}", cell.text),
-                None => cell.text.clone(),
+            table.add_row(row.iter().map(|cell| match mark(cell.mood()) {
+                Some(mark) => format!("{mark}{}{mark}", cell.text()),
+                None => cell.text().to_owned(),
             }));
         }
         let mut widths = table.column_max_content_widths();

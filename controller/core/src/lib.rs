@@ -19,12 +19,14 @@
 //! | [`offer`] | which frameworks are shown what, and whose Accept passes |
 //! | [`fairness`] | namespaces' shares, and what their quotas leave of what can be reserved |
 //! | [`quota`] | whether a namespace's quota lets a new task in |
+//! | [`apply`] | whose each field of an object is, and what an object becomes when somebody applies a part of it |
 //! | [`hold`] | why a task is not considered for a place at all |
 //! | [`config`] | what a task gets of ConfigMaps and Secrets |
 //! | [`deadline`] | when a task has been on its node, or has been over, for long enough |
 //! | [`radius`] | when a robot has left the radius of a task that runs on it |
 //! | [`reschedule`] | whether a task that failed is tried on another node, and when |
 //! | [`deletion`] | when an object is to be gone that somebody deletes |
+//! | [`project`] | tasks and nodes as Kubernetes' Pods and Nodes |
 //! | [`recent`] | one allocation for what many nodes or tasks have in common |
 //! | [`node_health`] | when a node counts as lost |
 //! | [`taskset`] | which tasks of a TaskSet begin, end and follow each other |
@@ -36,6 +38,7 @@
 //! | [`report`] | typed reasons, with the words people read |
 #![deny(missing_docs)]
 
+pub mod apply;
 pub mod cluster;
 pub mod config;
 pub mod deadline;
@@ -50,6 +53,7 @@ pub mod offer;
 pub mod offload;
 pub mod poses;
 pub mod preempt;
+pub mod project;
 pub mod quota;
 pub mod radius;
 pub mod recent;

@@ -1,4 +1,4 @@
-//! Bodies: JSON only, of a limited size.
+//! Bodies, of a limited size: JSON, and what kubectl sends in protobuf.
 
 use axum::body::Body;
 use bytes::Bytes;
@@ -8,6 +8,7 @@ use serde::de::DeserializeOwned;
 use serde_json::Value;
 
 use super::failure::Failure;
+use super::protobuf::{self, PROTOBUF};
 
 /// As much as Kubernetes takes.
 const LIMIT: usize = 3 << 20;
@@ -43,6 +44,9 @@ pub(super) async fn bytes(body: Body) -> Result<Bytes, Failure> {
 /// A JSON body; a request that does not say what it sends is taken to send JSON.
 pub(super) async fn json(headers: &HeaderMap, body: Body) -> Result<Value, Failure> {
     let found = media_type(headers);
+    if found == PROTOBUF {
+        return protobuf::json(&bytes(body).await?);
+    }
     if !matches!(found.as_str(), "" | "application/json") {
         return Err(unsupported(&found, "application/json"));
     }
@@ -55,6 +59,9 @@ pub(super) async fn optional_json(headers: &HeaderMap, body: Body) -> Result<Val
     let bytes = bytes(body).await?;
     if bytes.is_empty() {
         return Ok(Value::Null);
+    }
+    if found == PROTOBUF {
+        return protobuf::json(&bytes);
     }
     if !matches!(found.as_str(), "" | "application/json") {
         return Err(unsupported(&found, "application/json"));

@@ -12,6 +12,7 @@ use serde_json::Value;
 use super::path::Object;
 use super::query::FieldValidation;
 use super::registry::Entry;
+use super::update::Options;
 use super::{Answer, Call, admission, body, failure::Failure, metadata, namespace};
 use crate::context::Context;
 use crate::depends;
@@ -33,8 +34,27 @@ pub(super) async fn create(call: Call, target: Object) -> Answer {
     let Call { context, request, .. } = call;
     let (parts, body) = request.into_parts();
     let object = body::json(&parts.headers, body).await?;
-    let request = New { entry: target.entry, namespace: target.namespace.as_deref(), mode, dry };
+    let namespace = target.namespace.as_deref();
+    let request = New { entry: target.entry, namespace, mode, dry, owners: None };
     let (bytes, warnings) = store_new(&context, &request, object).await?;
+    Ok(with_warnings(super::raw(StatusCode::CREATED, bytes), warnings))
+}
+
+/// Creates an object that is applied and is not there yet.
+pub(super) async fn by_application(
+    context: &Context,
+    target: &Object,
+    object: Value,
+    options: &Options,
+) -> Answer {
+    let new = New {
+        entry: target.entry,
+        namespace: target.namespace.as_deref(),
+        mode: options.mode,
+        dry: options.dry,
+        owners: object["metadata"].get("managedFields").cloned(),
+    };
+    let (bytes, warnings) = store_new(context, &new, object).await?;
     Ok(with_warnings(super::raw(StatusCode::CREATED, bytes), warnings))
 }
 
@@ -50,8 +70,13 @@ pub async fn create_object(
     let entry = super::registry::of(resource)
         .ok_or_else(|| Failure::internal(format!("{resource} is not served")))?;
     let namespace = metadata::text(&object, "namespace").map(str::to_owned);
-    let new =
-        New { entry, namespace: namespace.as_deref(), mode: FieldValidation::Strict, dry: false };
+    let new = New {
+        entry,
+        namespace: namespace.as_deref(),
+        mode: FieldValidation::Strict,
+        dry: false,
+        owners: None,
+    };
     let prepared = prepare(context, &new, object)?;
     let _pass = pass(context, entry.resource, &prepared.object)?;
     commit(context, &new, prepared.object).await
@@ -69,8 +94,13 @@ pub(crate) fn prepare_object(
     let entry = super::registry::of(resource)
         .ok_or_else(|| Failure::internal(format!("{resource} is not served")))?;
     let namespace = metadata::text(&object, "namespace").map(str::to_owned);
-    let new =
-        New { entry, namespace: namespace.as_deref(), mode: FieldValidation::Strict, dry: false };
+    let new = New {
+        entry,
+        namespace: namespace.as_deref(),
+        mode: FieldValidation::Strict,
+        dry: false,
+        owners: None,
+    };
     prepare(context, &new, object).map(|prepared| prepared.object)
 }
 
@@ -141,6 +171,8 @@ struct New<'a> {
     namespace: Option<&'a str>,
     mode: FieldValidation,
     dry: bool,
+    /// Whose its fields are, when somebody keeps account.
+    owners: Option<Value>,
 }
 
 async fn store_new(
@@ -219,6 +251,9 @@ fn prepare(
     if new.entry.resource == TASKS {
         depends::check(&context.store, &admitted.object)
             .map_err(|violations| Failure::invalid(new.entry, &name, &violations))?;
+    }
+    if let Some(owners) = &new.owners {
+        admitted.object["metadata"]["managedFields"] = owners.clone();
     }
     if info.kind == "Namespace" {
         namespace::complete(&mut admitted.object);

@@ -95,7 +95,7 @@ pub(super) async fn delete(call: Call, target: Object) -> Answer {
     let key = target.key()?;
     let ended = end(&context, target.entry, &key, &options).await?;
     Ok(match ended {
-        Ended::Waiting(stored) => super::raw(StatusCode::OK, stored.bytes.clone()),
+        Ended::Waiting(stored) => super::raw(StatusCode::OK, target.entry.render(&stored)),
         Ended::Gone(stored) => gone(target.entry, &stored),
     })
 }
@@ -113,7 +113,8 @@ pub(super) async fn collection(call: Call, target: Object) -> Answer {
             Err(failure) => return Err(failure),
         }
     }
-    let items: Vec<Value> = snapshot.items.iter().map(|stored| stored.value()).collect();
+    let items: Vec<Value> =
+        snapshot.items.iter().map(|stored| target.entry.value(stored)).collect();
     let info = target.entry.info;
     let list = json!({
         "kind": format!("{}List", info.kind),

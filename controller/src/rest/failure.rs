@@ -83,6 +83,13 @@ impl Failure {
         Self::new(StatusCode::GATEWAY_TIMEOUT, "Timeout", message)
     }
 
+    /// More is asked at once than is worked on.
+    pub(crate) fn too_many() -> Self {
+        let message = "too many requests at once; try again";
+        let code = StatusCode::TOO_MANY_REQUESTS;
+        Self::new(code, "TooManyRequests", message).retry_after(1)
+    }
+
     pub(crate) fn internal(message: impl Into<String>) -> Self {
         Self::new(StatusCode::INTERNAL_SERVER_ERROR, "InternalError", message)
     }
@@ -167,8 +174,7 @@ impl Failure {
 
     /// Says which object it is about.
     pub(crate) fn about(mut self, entry: &Entry, name: &str) -> Self {
-        self.details =
-            json!({"name": name, "group": entry.info.group, "kind": entry.resource.as_str()});
+        self.details = json!({"name": name, "group": entry.info.group, "kind": entry.info.plural});
         self
     }
 
@@ -178,6 +184,24 @@ impl Failure {
             self.details = json!({});
         }
         self.details["causes"] = json!([{"reason": reason, "message": message, "field": field}]);
+        self
+    }
+
+    /// Says all its causes.
+    pub(crate) fn with_causes(mut self, causes: Vec<Value>) -> Self {
+        if self.details.is_null() {
+            self.details = json!({});
+        }
+        self.details["causes"] = causes.into();
+        self
+    }
+
+    /// Says when it is worth to ask again.
+    pub(crate) fn retry_after(mut self, seconds: u64) -> Self {
+        if self.details.is_null() {
+            self.details = json!({});
+        }
+        self.details["retryAfterSeconds"] = seconds.into();
         self
     }
 

@@ -12,10 +12,11 @@ use bytes::Bytes;
 use futures::stream;
 use http::StatusCode;
 use serde::{Deserialize, Serialize};
-use serde_json::json;
 
 use super::failure::Failure;
+use super::form::Form;
 use super::path::Object;
+use super::registry::Entry;
 use super::selector::Selection;
 use super::{Answer, Call};
 use crate::store::{Key, Snapshot, Stored};
@@ -25,8 +26,9 @@ const CHUNK: usize = 64 << 10;
 
 pub(super) fn get(call: &Call, target: &Object) -> Answer {
     let key = target.key()?;
+    let form = Form::read(call.request.headers(), &call.query)?;
     match call.context.store.get(&key) {
-        Some(stored) => Ok(super::raw(StatusCode::OK, stored.bytes.clone())),
+        Some(stored) => Ok(form.answer(StatusCode::OK, target.entry, &stored)),
         None => Err(Failure::not_found(target.entry, &key.name)),
     }
 }
@@ -59,29 +61,25 @@ impl Continue {
 
 pub(super) fn list(call: &Call, target: &Object) -> Answer {
     let selection = Selection::read(target.entry, target.namespace.as_deref(), &call.query)?;
+    let form = Form::read(call.request.headers(), &call.query)?;
     let limit = call.query.parse::<usize>("limit")?.filter(|limit| *limit > 0);
     let Snapshot { revision, mut items } = snapshot(call, target)?;
     if !selection.is_everything() {
         items.retain(|stored| selection.matches(stored));
     }
-    let mut metadata = json!({"resourceVersion": revision.to_string()});
+    let mut more = String::new();
     if let Some(limit) = limit.filter(|limit| *limit < items.len()) {
         let left = items.len() - limit;
         items.truncate(limit);
         if let Some(last) = items.last() {
-            metadata["continue"] = Continue::write(revision, &last.key).into();
+            more = format!(",\"continue\":\"{}\"", Continue::write(revision, &last.key));
         }
         if selection.is_everything() {
-            metadata["remainingItemCount"] = left.into();
+            more.push_str(&format!(",\"remainingItemCount\":{left}"));
         }
     }
-    let info = target.entry.info;
-    let head = format!(
-        "{{\"kind\":\"{}List\",\"apiVersion\":\"{}\",\"metadata\":{metadata},\"items\":[",
-        info.kind,
-        info.api_version()
-    );
-    Ok(super::raw(StatusCode::OK, join(head, items, "]}\n")))
+    let head = form.head(target.entry, &revision.to_string(), &more);
+    Ok(super::raw(StatusCode::OK, join(head, items, (form, target.entry))))
 }
 
 /// The collection at the revision that the request asks for.
@@ -111,8 +109,8 @@ fn snapshot(call: &Call, target: &Object) -> Result<Snapshot, Failure> {
     }
 }
 
-/// `head`, the objects with commas between them, `tail`; in chunks.
-fn join(head: String, items: Vec<Arc<Stored>>, tail: &'static str) -> Body {
+/// The head, the objects with commas between them, the tail; in chunks.
+fn join(head: String, items: Vec<Arc<Stored>>, (form, entry): (Form, &'static Entry)) -> Body {
     let mut items = items.into_iter().enumerate();
     let mut begin = Some(head.into_bytes());
     let mut ended = false;
@@ -125,13 +123,13 @@ fn join(head: String, items: Vec<Arc<Stored>>, tail: &'static str) -> Body {
         while chunk.len() < CHUNK {
             let Some((index, stored)) = items.next() else {
                 ended = true;
-                chunk.extend_from_slice(tail.as_bytes());
+                chunk.extend_from_slice(form.tail().as_bytes());
                 break;
             };
             if index > 0 {
                 chunk.push(b',');
             }
-            chunk.extend_from_slice(&stored.bytes);
+            chunk.extend_from_slice(&form.item(entry, &stored));
         }
         Some(Ok::<_, std::convert::Infallible>(Bytes::from(chunk)))
     });

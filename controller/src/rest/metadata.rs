@@ -4,7 +4,7 @@ use serde_json::{Map, Value};
 
 use crate::context::Context;
 
-/// Never taken from a client, and not kept either: field ownership is not tracked yet.
+/// Never taken from a client as they are; whose each field is, is said in its own place (`owners`).
 const IGNORED: [&str; 2] = ["managedFields", "selfLink"];
 /// Set once by the server, or only by a deletion.
 const KEPT: [&str; 5] =

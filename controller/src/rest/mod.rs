@@ -5,15 +5,19 @@
 //! | file | answers |
 //! |---|---|
 //! | [`path`] | URL + method → target and verb |
-//! | `query`, `body` | parameters; JSON bodies with their limit |
+//! | `query`, `body`, `protobuf` | parameters; bodies with their limit |
 //! | `registry` | what is served: one entry a kind |
-//! | `discovery` | /api, /apis, resource lists, /version |
+//! | `discovery`, `openapi` | /api, /apis, resource lists, /version; schemas of everything |
+//! | `form` | whole objects, their metadata, or tables |
 //! | [`create`], `list`, `watch`, `update`, `patch`, [`delete`] | verbs on objects |
+//! | `owners`, `strategic` | server-side apply and field owners; kubectl's merge of core kinds |
 //! | `metadata`, `admission` | server-owned fields; violations, unknown fields |
 //! | `selector` | label and field selectors |
 //! | [`namespace`] | the default namespace; ending of namespaces |
 //! | [`token`], `join`, `enrol` | join tokens; certificates for agents; which agent speaks for a node |
 //! | `scale` | how many tasks a set has, as `autoscaling/v1` Scale |
+//! | `core_node`, `eviction`, `metrics_api` | what is written through core kinds; `kubectl drain`, `kubectl top` |
+//! | `review` | what a client may do, and who it is |
 //! | `fence` | a person's word that a node is off |
 //! | `offers` | what frameworks are offered, and why they are not |
 //! | `poses` | where robots are now |
@@ -24,26 +28,35 @@
 
 mod admission;
 mod body;
+mod core_node;
 pub mod create;
 pub mod delete;
 mod discovery;
 pub(crate) mod enrol;
+mod eviction;
 pub mod failure;
 mod fence;
+mod form;
 mod join;
 mod list;
 pub mod log;
 mod metadata;
+mod metrics_api;
 pub mod namespace;
 mod offers;
+mod openapi;
+mod owners;
 mod patch;
 pub mod path;
 mod poses;
+mod protobuf;
 mod query;
 mod question;
 pub(crate) mod registry;
+mod review;
 mod scale;
 mod selector;
+mod strategic;
 mod together;
 pub mod token;
 mod update;
@@ -58,15 +71,21 @@ use axum::extract::State;
 use axum::response::{IntoResponse as _, Response};
 use http::{HeaderValue, Request, StatusCode, header};
 use serde_json::Value;
+use tokio::sync::Semaphore;
 
 use crate::auth::{Identity, Permission, permits};
 use crate::context::Context;
 use failure::Failure;
 use path::{Object, Subresource, Target, Verb};
 use query::Query;
+use registry::View;
 
 /// An answer that takes longer than this is a fault of ours, and the client should hear of it.
 const TIMEOUT: Duration = Duration::from_secs(60);
+/// Requests that are worked on at once, without those that last (watches, logs). A client that finds them all taken is
+/// told to come back: a queue would only make everybody late. One core answers thousands in a second.
+const AT_ONCE: usize = 512;
+static PLACES: Semaphore = Semaphore::const_new(AT_ONCE);
 
 /// Bytes, ready to be an answer.
 pub(crate) type Answer = Result<Response, Failure>;
@@ -99,9 +118,12 @@ async fn handle(State(context): State<Arc<Context>>, request: Request<Body>) -> 
         Err(failure) => Err(failure),
         Ok((verb, target)) if long => dispatch(context, verb, target, request).await,
         Ok((verb, target)) => {
-            match tokio::time::timeout(TIMEOUT, dispatch(context, verb, target, request)).await {
-                Ok(answer) => answer,
-                Err(_) => Err(Failure::timeout("the request was not answered in time")),
+            // Whether it lives is asked when it is busy, above all.
+            let place = PLACES.try_acquire();
+            if place.is_err() && !matches!(target, Target::Health(_)) {
+                Err(Failure::too_many())
+            } else {
+                within(TIMEOUT, dispatch(context, verb, target, request)).await
             }
         }
     };
@@ -115,6 +137,14 @@ async fn handle(State(context): State<Arc<Context>>, request: Request<Body>) -> 
             .record(start.elapsed());
     }
     response
+}
+
+/// The answer, or that there was none in time.
+async fn within(limit: Duration, answer: impl Future<Output = Answer>) -> Answer {
+    match tokio::time::timeout(limit, answer).await {
+        Ok(answer) => answer,
+        Err(_) => Err(Failure::timeout("the request was not answered in time")),
+    }
 }
 
 async fn dispatch(
@@ -137,7 +167,10 @@ async fn dispatch(
         Target::Health(probe) => health(&call.context, probe),
         Target::Metrics => Ok(call.context.metrics.render().into_response()),
         Target::Version => Ok(json(StatusCode::OK, &discovery::version())),
-        Target::Discovery(what) => discovery::answer(what),
+        Target::Discovery(what) => discovery::answer(&call.request, what),
+        Target::OpenApi(of) => openapi::answer(&call.request, of),
+        Target::Review(review) => review::answer(call, review).await,
+        Target::Measured(measured) => metrics_api::answer(&call, &measured),
         Target::Join => join::join(call).await,
         Target::Plan => question::plan(call).await,
         Target::Check => together::check(call).await,
@@ -168,6 +201,12 @@ async fn objects(call: Call, verb: Verb, object: Object) -> Answer {
     }
     if object.subresource == Some(Subresource::Scale) {
         return scale::answer(call, verb, object).await;
+    }
+    if object.subresource == Some(Subresource::Eviction) {
+        return eviction::evict(call, object).await;
+    }
+    if object.entry.view == View::Node && matches!(verb, Verb::Update | Verb::Patch) {
+        return core_node::write(call, verb, object).await;
     }
     match verb {
         Verb::Get => list::get(&call, &object),

@@ -10,7 +10,7 @@ use muster_api::kind::namespace::DEFAULT;
 use serde_json::{Value, json};
 
 use super::failure::Failure;
-use super::registry::{self, Entry};
+use super::registry::{self, Entry, View};
 use super::{delete, metadata};
 use crate::context::Context;
 use crate::store::{Key, Op, Precondition, Resource, StoreError, WatchEnd};
@@ -133,7 +133,9 @@ async fn changed(context: &Context, seen: u64, waiting: bool) -> bool {
 /// Deletes what is inside, and the namespace when nothing is left.
 async fn empty(context: &Context, key: &Key) -> Result<(), Failure> {
     let mut left = false;
-    for entry in registry::all().iter().filter(|entry| entry.info.namespaced) {
+    for entry in
+        registry::all().iter().filter(|entry| entry.info.namespaced && entry.view == View::Stored)
+    {
         for stored in context.store.list(entry.resource, Some(&key.name)).items {
             left = true;
             match delete::delete_object(context, &stored.key).await {

@@ -2,8 +2,12 @@
 
 use http::{Method, Uri};
 
+use super::discovery::{self, ApiGroup};
 use super::failure::Failure;
-use super::registry::{self, Entry};
+use super::metrics_api::{self, Measured};
+use super::registry::{self, Entry, View};
+use super::review::Review;
+use crate::objects::NODES;
 use crate::store::Key;
 
 /// What a request does, in Kubernetes' words.
@@ -44,6 +48,23 @@ impl Verb {
     }
 }
 
+impl Verb {
+    /// The verb of this name.
+    pub(crate) fn named(name: &str) -> Option<Self> {
+        let all = [
+            Self::Get,
+            Self::List,
+            Self::Watch,
+            Self::Create,
+            Self::Update,
+            Self::Patch,
+            Self::Delete,
+            Self::DeleteCollection,
+        ];
+        all.into_iter().find(|verb| verb.as_str() == name)
+    }
+}
+
 /// Which question about health.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Probe {
@@ -62,10 +83,10 @@ pub enum Discovery {
     Core,
     /// `/apis`
     Groups,
-    /// `/apis/muster.dev`
-    Group,
-    /// `/api/v1` (empty group) or `/apis/muster.dev/v1alpha1`
-    Resources(&'static str),
+    /// `/apis/GROUP`
+    Group(&'static ApiGroup),
+    /// `/api/v1` or `/apis/GROUP/VERSION`
+    Resources(&'static ApiGroup),
 }
 
 /// A part of an object with a path of its own.
@@ -83,6 +104,8 @@ pub enum Subresource {
     Pose,
     /// `…/scale`
     Scale,
+    /// `…/eviction`
+    Eviction,
 }
 
 /// One object, or a collection when `name` is `None`.
@@ -105,7 +128,7 @@ impl Object {
     pub(crate) fn allows(&self, verb: Verb) -> bool {
         match self.subresource {
             Some(Subresource::Log | Subresource::Why | Subresource::Pose) => verb == Verb::Get,
-            Some(Subresource::Fence) => verb == Verb::Create,
+            Some(Subresource::Fence | Subresource::Eviction) => verb == Verb::Create,
             Some(Subresource::Scale) => matches!(verb, Verb::Get | Verb::Update | Verb::Patch),
             Some(Subresource::Status) => {
                 self.entry.info.has_status
@@ -132,6 +155,12 @@ pub(crate) enum Target {
     Check,
     /// What nodes and tasks use now.
     Usage,
+    /// What nodes and tasks use now, for `kubectl top`.
+    Measured(Measured),
+    /// What the client itself may do, and who it is.
+    Review(Review),
+    /// OpenAPI: the index, or the document of a group.
+    OpenApi(Option<&'static ApiGroup>),
     /// What frameworks are offered now.
     Offers,
     /// Where robots are now.
@@ -145,7 +174,9 @@ impl Target {
     /// The plural, for metrics and messages.
     pub(crate) fn resource(&self) -> Option<&'static str> {
         match self {
-            Self::Objects(object) => Some(object.entry.resource.as_str()),
+            Self::Objects(object) => Some(object.entry.info.plural),
+            Self::Measured(_) => Some("metrics"),
+            Self::Review(_) => Some("reviews"),
             Self::Tokens(_) => Some("jointokens"),
             Self::Join => Some("join"),
             Self::Plan => Some("plan"),
@@ -171,10 +202,31 @@ pub(crate) fn read(method: &Method, uri: &Uri) -> Result<(Verb, Target), Failure
         [] => Target::Discovery(Discovery::Root),
         ["api"] => Target::Discovery(Discovery::Core),
         ["apis"] => Target::Discovery(Discovery::Groups),
-        ["apis", muster_api::GROUP] => Target::Discovery(Discovery::Group),
-        ["api", "v1"] => Target::Discovery(Discovery::Resources("")),
-        ["apis", muster_api::GROUP, muster_api::VERSION] => {
-            Target::Discovery(Discovery::Resources(muster_api::GROUP))
+        ["openapi", "v3"] => Target::OpenApi(None),
+        ["openapi", "v3", "api", "v1"] => Target::OpenApi(discovery::find("", "v1")),
+        ["openapi", "v3", "apis", group, version] => {
+            Target::OpenApi(Some(discovery::find(group, version).ok_or_else(unknown)?))
+        }
+        ["apis", group] => {
+            let group = discovery::named(group).ok_or_else(unknown)?;
+            Target::Discovery(Discovery::Group(group))
+        }
+        ["api", "v1"] => Target::Discovery(Discovery::Resources(&discovery::GROUPS[0])),
+        ["apis", group, version] => {
+            let group = discovery::find(group, version).ok_or_else(unknown)?;
+            Target::Discovery(Discovery::Resources(group))
+        }
+        ["apis", "authorization.k8s.io", "v1", "selfsubjectaccessreviews"] => {
+            Target::Review(Review::Access)
+        }
+        ["apis", "authorization.k8s.io", "v1", "selfsubjectrulesreviews"] => {
+            Target::Review(Review::Rules)
+        }
+        ["apis", "authentication.k8s.io", "v1", "selfsubjectreviews"] => {
+            Target::Review(Review::Subject)
+        }
+        ["apis", metrics_api::GROUP, metrics_api::VERSION, ref rest @ ..] => {
+            Target::Measured(measured(rest).ok_or_else(unknown)?)
         }
         ["api", "v1", ref rest @ ..] => Target::Objects(object("", rest).ok_or_else(unknown)?),
         ["apis", muster_api::GROUP, muster_api::VERSION, ref rest @ ..] => match rest {
@@ -194,6 +246,7 @@ pub(crate) fn read(method: &Method, uri: &Uri) -> Result<(Verb, Target), Failure
         Target::Objects(object) => object.name.is_some(),
         Target::Tokens(id) => id.is_some(),
         Target::Poses => false,
+        Target::Measured(measured) => measured.name.is_some(),
         _ => true,
     };
     let verb = verb(method, uri, named).ok_or_else(|| Failure::method(method))?;
@@ -203,14 +256,31 @@ pub(crate) fn read(method: &Method, uri: &Uri) -> Result<(Verb, Target), Failure
             | Target::Metrics
             | Target::Version
             | Target::Discovery(_)
+            | Target::OpenApi(_)
             | Target::Usage
     );
-    let post_only = matches!(target, Target::Join | Target::Plan | Target::Check);
+    let post_only =
+        matches!(target, Target::Join | Target::Plan | Target::Check | Target::Review(_));
+    let read_only =
+        read_only || matches!(target, Target::Measured(_)) && !matches!(verb, Verb::List);
     let followed = matches!(target, Target::Poses) && !matches!(verb, Verb::List | Verb::Watch);
     if read_only && verb != Verb::Get || post_only && verb != Verb::Create || followed {
         return Err(Failure::method(method));
     }
     Ok((verb, target))
+}
+
+/// `nodes[/NAME]`, `pods` or `namespaces/NS/pods[/NAME]`.
+fn measured(parts: &[&str]) -> Option<Measured> {
+    let (pods, namespace, name) = match *parts {
+        ["nodes"] => (false, None, None),
+        ["nodes", name] => (false, None, Some(name)),
+        ["pods"] => (true, None, None),
+        ["namespaces", namespace, "pods"] => (true, Some(namespace), None),
+        ["namespaces", namespace, "pods", name] => (true, Some(namespace), Some(name)),
+        _ => return None,
+    };
+    Some(Measured { pods, namespace: namespace.map(str::to_owned), name: name.map(str::to_owned) })
 }
 
 fn verb(method: &Method, uri: &Uri, named: bool) -> Option<Verb> {
@@ -252,8 +322,13 @@ fn object(group: &str, parts: &[&str]) -> Option<Object> {
         Some("status") if entry.info.has_status => Some(Subresource::Status),
         Some("log") if entry.has_log => Some(Subresource::Log),
         Some("why") if entry.has_why => Some(Subresource::Why),
-        Some("fence") if entry.info.kind == "Node" => Some(Subresource::Fence),
-        Some("pose") if entry.info.kind == "Node" => Some(Subresource::Pose),
+        Some("fence") if entry.resource == NODES && entry.view == View::Stored => {
+            Some(Subresource::Fence)
+        }
+        Some("pose") if entry.resource == NODES && entry.view == View::Stored => {
+            Some(Subresource::Pose)
+        }
+        Some("eviction") if entry.info.kind == "Pod" => Some(Subresource::Eviction),
         Some("scale") if entry.info.kind == "TaskSet" => Some(Subresource::Scale),
         Some(_) => return None,
     };
@@ -334,7 +409,17 @@ mod tests {
                 "/api/v1/namespaces/a/events".into(),
                 "list events ns=Some(\"a\") name=None sub=None",
             ),
-            ("GET", "/api/v1/pods".into(), "404"),
+            ("GET", "/api/v1/pods".into(), "list tasks ns=None name=None sub=None"),
+            ("POST", "/api/v1/pods".into(), "create tasks ns=None name=None sub=None"),
+            (
+                "POST",
+                "/api/v1/namespaces/a/pods/t/eviction".into(),
+                "create tasks ns=Some(\"a\") name=Some(\"t\") sub=Some(Eviction)",
+            ),
+            ("GET", "/api/v1/nodes/n/pose".into(), "404"),
+            ("GET", "/apis/metrics.k8s.io/v1beta1/things".into(), "404"),
+            ("POST", "/openapi/v3".into(), "405"),
+            ("GET", "/openapi/v2".into(), "404"),
             ("GET", "/apis/other/v1/things".into(), "404"),
             ("PUT", format!("{g}/nodes"), "405"),
             ("POST", "/healthz".into(), "405"),

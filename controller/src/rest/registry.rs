@@ -1,15 +1,29 @@
-//! What is served: one entry a kind, made from `muster_api`'s list of kinds.
+//! What is served: one entry a kind, made from `muster_api`'s list of kinds; and the views of tasks and nodes as core
+//! kinds.
 
 use std::sync::LazyLock;
 
-use muster_api::kind::{self, KindInfo};
+use bytes::Bytes;
+use muster_api::kind::{self, KindInfo, projected};
+use muster_controller_core::project;
+use serde_json::Value;
 
 use super::path::Verb;
-use crate::store::{Key, Resource};
+use crate::objects::{NODES, TASKS};
+use crate::store::{Key, Resource, Stored};
 
 const READ: &[Verb] = &[Verb::Get, Verb::List, Verb::Watch];
 const READ_AND_REMOVE: &[Verb] =
     &[Verb::Delete, Verb::DeleteCollection, Verb::Get, Verb::List, Verb::Watch];
+const ALL_BUT_CREATE: &[Verb] = &[
+    Verb::Delete,
+    Verb::DeleteCollection,
+    Verb::Get,
+    Verb::List,
+    Verb::Patch,
+    Verb::Update,
+    Verb::Watch,
+];
 const ALL: &[Verb] = &[
     Verb::Create,
     Verb::Delete,
@@ -21,15 +35,15 @@ const ALL: &[Verb] = &[
     Verb::Watch,
 ];
 
-/// A column of the server-side table.
-#[derive(Debug)]
-pub(crate) struct Column {
-    /// The head.
-    #[expect(dead_code, reason = "tables are rendered by clients so far")]
-    pub(crate) name: &'static str,
-    /// The dotted path of the cell.
-    #[expect(dead_code, reason = "tables are rendered by clients so far")]
-    pub(crate) path: &'static str,
+/// How what is stored is shown as this kind.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum View {
+    /// As it is.
+    Stored,
+    /// A Task as a core Pod.
+    Pod,
+    /// A Node as a core Node.
+    Node,
 }
 
 /// One kind as it is served.
@@ -42,14 +56,38 @@ pub(crate) struct Entry {
     pub(crate) has_log: bool,
     /// `…/why` says why it waits.
     pub(crate) has_why: bool,
-    #[expect(dead_code, reason = "tables are rendered by clients so far")]
-    pub(crate) columns: &'static [Column],
+    /// `resource` is where the objects are stored; this is how they are shown.
+    pub(crate) view: View,
 }
 
 impl Entry {
     pub(crate) fn key(&self, namespace: Option<&str>, name: &str) -> Key {
         let namespace = namespace.filter(|_| self.info.namespaced).map(Into::into);
         Key { resource: self.resource, namespace, name: name.into() }
+    }
+
+    /// The object as it is shown. One that does not read as its kind is shown as it is stored.
+    pub(crate) fn value(&self, stored: &Stored) -> Value {
+        let object = stored.value();
+        match self.view {
+            View::Stored => object,
+            View::Pod => match stored.parse() {
+                Ok(task) => project::pod::pod(&object, &task),
+                Err(_) => object,
+            },
+            View::Node => match stored.parse() {
+                Ok(node) => project::node::node(&object, &node),
+                Err(_) => object,
+            },
+        }
+    }
+
+    /// The same as JSON.
+    pub(crate) fn render(&self, stored: &Stored) -> Bytes {
+        match self.view {
+            View::Stored => stored.bytes.clone(),
+            View::Pod | View::Node => self.value(stored).to_string().into(),
+        }
     }
 
     /// `tasks.muster.dev`, or `namespaces` for core kinds.
@@ -67,7 +105,24 @@ fn with_group(name: &str, group: &str) -> String {
     if group.is_empty() { name.to_owned() } else { format!("{name}.{group}") }
 }
 
-static ENTRIES: LazyLock<Vec<Entry>> = LazyLock::new(|| kind::ALL.iter().map(entry).collect());
+// What is stored comes first: an entry of a stored resource is found before its views.
+static ENTRIES: LazyLock<Vec<Entry>> = LazyLock::new(|| {
+    let stored = kind::ALL.iter().map(entry);
+    let pods = Entry {
+        resource: TASKS,
+        verbs: READ_AND_REMOVE,
+        has_log: true,
+        view: View::Pod,
+        ..entry(&projected::POD)
+    };
+    let nodes = Entry {
+        resource: NODES,
+        verbs: ALL_BUT_CREATE,
+        view: View::Node,
+        ..entry(&projected::NODE)
+    };
+    stored.chain([pods, nodes]).collect()
+});
 
 fn entry(info: &'static KindInfo) -> Entry {
     Entry {
@@ -82,10 +137,15 @@ fn entry(info: &'static KindInfo) -> Entry {
             "TaskSetRevision" => READ_AND_REMOVE,
             _ => ALL,
         },
-        categories: if info.group.is_empty() { &[] } else { &["muster"] },
+        categories: match info.kind {
+            "Task" | "TaskSet" => &["all", "muster"],
+            "Pod" => &["all"],
+            _ if info.group.is_empty() => &[],
+            _ => &["muster"],
+        },
         has_log: info.kind == "Task",
         has_why: matches!(info.kind, "Task" | "Framework"),
-        columns: &[],
+        view: View::Stored,
     }
 }
 

@@ -18,11 +18,11 @@ pub(super) async fn answer(call: Call, verb: Verb, target: Object) -> Answer {
         let stored = stored.ok_or_else(|| Failure::not_found(target.entry, &key.name))?;
         return Ok(super::json(StatusCode::OK, &scale_of(&stored.value())));
     }
-    let options = Options::read(&call)?;
+    let options = Options::read(&call, &target)?;
     let Call { context, request, .. } = call;
     let set = Object { subresource: None, ..target };
     let changed = if verb == Verb::Patch {
-        let patch = patch::of_request(request).await?;
+        let patch = patch::of_request(request, false).await?;
         let make = |present: &Value| {
             let scale = patch::apply(&patch, &scale_of(present))?;
             with_replicas(&set, present, &scale)
@@ -38,7 +38,7 @@ pub(super) async fn answer(call: Call, verb: Verb, target: Object) -> Answer {
     Ok(super::json(StatusCode::OK, &scale_of(&object)))
 }
 
-async fn read(body: Body) -> Result<Value, Failure> {
+pub(super) async fn read(body: Body) -> Result<Value, Failure> {
     let whole = body.collect().await;
     let bytes = whole.map_err(|error| Failure::internal(error.to_string()))?.to_bytes();
     body::parse(&bytes)

@@ -1,16 +1,17 @@
 //! Label and field selectors of a request.
 
 use muster_api::selector::{FieldSelector, LabelSelector, Labels};
-use serde::Deserialize;
+use serde::Deserialize as _;
 
 use super::failure::Failure;
 use super::query::Query;
-use super::registry::Entry;
+use super::registry::{Entry, View};
 use crate::store::Stored;
 
 /// What of a collection is asked for.
 #[derive(Debug, Clone)]
 pub(super) struct Selection {
+    entry: &'static Entry,
     namespace: Option<String>,
     labels: LabelSelector,
     /// Requirements on name and namespace, which need no look into the object.
@@ -18,20 +19,9 @@ pub(super) struct Selection {
     fields: FieldSelector,
 }
 
-#[derive(Deserialize)]
-struct Labelled {
-    metadata: LabelledMetadata,
-}
-
-#[derive(Deserialize)]
-struct LabelledMetadata {
-    #[serde(default)]
-    labels: Option<Labels>,
-}
-
 impl Selection {
     pub(super) fn read(
-        entry: &Entry,
+        entry: &'static Entry,
         namespace: Option<&str>,
         query: &Query,
     ) -> Result<Self, Failure> {
@@ -55,7 +45,13 @@ impl Selection {
             }
         }
         let namespace = namespace.map(str::to_owned);
-        Ok(Self { namespace, labels, place: FieldSelector(place), fields: FieldSelector(fields) })
+        Ok(Self {
+            entry,
+            namespace,
+            labels,
+            place: FieldSelector(place),
+            fields: FieldSelector(fields),
+        })
     }
 
     /// Whether everything in the namespace is asked for.
@@ -82,11 +78,16 @@ impl Selection {
         if self.labels.is_empty() {
             return true;
         }
-        let labels = stored.parse::<Labelled>().ok().and_then(|object| object.metadata.labels);
-        self.labels.matches(&labels.unwrap_or_default())
+        // The view of a node adds labels that are not stored.
+        if self.entry.view == View::Node {
+            let object = self.entry.value(stored);
+            let labels = Labels::deserialize(&object["metadata"]["labels"]);
+            return self.labels.matches(&labels.unwrap_or_default());
+        }
+        self.labels.matches(stored.labels())
     }
 
     fn fields_match(&self, stored: &Stored) -> bool {
-        self.fields.0.is_empty() || self.fields.matches(&stored.value())
+        self.fields.0.is_empty() || self.fields.matches(&self.entry.value(stored))
     }
 }

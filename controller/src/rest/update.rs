@@ -14,10 +14,11 @@ use serde::Deserialize as _;
 use serde_json::Value;
 
 use super::create::with_warnings;
+use super::owners::Writer;
 use super::path::{Object, Subresource};
 use super::query::FieldValidation;
 use super::registry::Entry;
-use super::{Answer, Call, admission, body, failure::Failure, metadata};
+use super::{Answer, Call, admission, body, failure::Failure, metadata, owners};
 use crate::context::Context;
 use crate::store::{Op, Precondition, Store, StoreError, Stored};
 
@@ -25,16 +26,41 @@ use crate::store::{Op, Precondition, Store, StoreError, Stored};
 pub(super) struct Options {
     pub(super) mode: FieldValidation,
     pub(super) dry: bool,
+    /// Who makes it.
+    pub(super) writer: Writer,
+    /// The change is an application: it says itself whose the fields are.
+    pub(super) applies: bool,
 }
 
 impl Options {
-    pub(super) fn read(call: &Call) -> Result<Self, Failure> {
-        Ok(Self { mode: call.query.field_validation()?, dry: call.query.dry_run()? })
+    pub(super) fn read(call: &Call, target: &Object) -> Result<Self, Failure> {
+        Ok(Self {
+            mode: call.query.field_validation()?,
+            dry: call.query.dry_run()?,
+            writer: Writer {
+                name: manager(call),
+                subresource: match target.subresource {
+                    Some(Subresource::Status) => "status",
+                    Some(Subresource::Scale) => "scale",
+                    _ => "",
+                },
+                time: call.context.stamp(),
+            },
+            applies: false,
+        })
     }
 }
 
+/// The client's own name for itself, or the first word of its user agent.
+fn manager(call: &Call) -> String {
+    let agent = call.request.headers().get(http::header::USER_AGENT);
+    let agent = agent.and_then(|value| value.to_str().ok()).unwrap_or_default();
+    let agent = agent.split('/').next().filter(|word| !word.is_empty()).unwrap_or("unknown");
+    call.query.text("fieldManager").unwrap_or(agent).chars().take(128).collect()
+}
+
 pub(super) async fn replace(call: Call, target: Object) -> Answer {
-    let options = Options::read(&call)?;
+    let options = Options::read(&call, &target)?;
     let Call { context, request, .. } = call;
     let (parts, body) = request.into_parts();
     let mut object = body::json(&parts.headers, body).await?;
@@ -55,7 +81,7 @@ pub(super) async fn change(
     loop {
         let present =
             context.store.get(&key).ok_or_else(|| Failure::not_found(entry, &key.name))?;
-        let next = next(target, &present, options.mode, &make)?;
+        let next = next(target, &present, options, &make)?;
         let done = |bytes: bytes::Bytes| {
             Ok(with_warnings(super::raw(StatusCode::OK, bytes), next.warnings.clone()))
         };
@@ -104,7 +130,7 @@ struct Next {
 fn next(
     target: &Object,
     present: &Stored,
-    mode: FieldValidation,
+    options: &Options,
     make: impl Fn(&Value) -> Result<Value, Failure>,
 ) -> Result<Next, Failure> {
     let entry = target.entry;
@@ -115,18 +141,21 @@ fn next(
     let pinned = check_identity(target, present, &new)?;
     if target.subresource == Some(Subresource::Status) {
         let status = new.get("status").cloned();
-        let mut object = old;
+        let mut object = old.clone();
         match (status, object.as_object_mut()) {
             (Some(status), Some(fields)) => drop(fields.insert("status".into(), status)),
             (None, Some(fields)) => drop(fields.remove("status")),
             (_, None) => {}
         }
         check_status(entry, name, &object)?;
+        let said = new["metadata"].get("managedFields").cloned();
+        set_owners(entry, &old, &mut object, said, options);
         return Ok(Next { object, warnings: Vec::new(), pinned });
     }
     let Some(own) = metadata::of(&mut new) else {
         return Err(Failure::bad_request("metadata is not a JSON object"));
     };
+    let said = own.get("managedFields").cloned();
     metadata::carry(&old, own);
     if entry.info.has_status
         && let Some(fields) = new.as_object_mut()
@@ -136,12 +165,27 @@ fn next(
             None => fields.remove("status"),
         };
     }
-    let mut admitted = admission::admit(entry, name, new, mode)?;
+    let mut admitted = admission::admit(entry, name, new, options.mode)?;
     kind::admit_change(entry.info, &old, &admitted.object)
         .map_err(|violations| Failure::invalid(entry, name, &violations))?;
     check_finalizers(entry, name, &old, &admitted.object)?;
     metadata::count(&old, &mut admitted.object);
+    set_owners(entry, &old, &mut admitted.object, said, options);
     Ok(Next { object: admitted.object, warnings: admitted.warnings, pinned })
+}
+
+/// Says whose the fields of a changed object are; `said` is what the client's object says of that.
+fn set_owners(entry: &Entry, old: &Value, new: &mut Value, said: Option<Value>, options: &Options) {
+    let owners = if options.applies {
+        said
+    } else {
+        owners::after_update(entry, (old, new), said.as_ref(), &options.writer)
+    };
+    let Some(metadata) = metadata::of(new) else { return };
+    match owners {
+        Some(owners) => drop(metadata.insert("managedFields".into(), owners)),
+        None => drop(metadata.remove("managedFields")),
+    }
 }
 
 /// Refuses a status that does not read as its kind: everything that works on the object would have to leave it alone

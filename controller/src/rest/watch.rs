@@ -16,6 +16,7 @@ use tokio::time::{Instant, Interval, MissedTickBehavior};
 use tokio_util::sync::CancellationToken;
 
 use super::failure::Failure;
+use super::form::Form;
 use super::path::Object;
 use super::registry::Entry;
 use super::selector::Selection;
@@ -33,6 +34,7 @@ const CHUNK: usize = 64 << 10;
 pub(super) fn watch(call: &Call, target: &Object) -> Answer {
     let selection = Selection::read(target.entry, target.namespace.as_deref(), &call.query)?;
     let bookmarks = call.query.flag("allowWatchBookmarks")?;
+    let form = Form::read(call.request.headers(), &call.query)?;
     let store = &call.context.store;
     let asked = call.query.revision()?;
     // The old way (no or zero revision) and the new (sendInitialEvents) of "first tell me what there is".
@@ -63,6 +65,7 @@ pub(super) fn watch(call: &Call, target: &Object) -> Answer {
             ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
             let following = Following {
                 entry: target.entry,
+                form,
                 selection,
                 watcher,
                 initial: queue,
@@ -85,6 +88,7 @@ pub(super) fn watch(call: &Call, target: &Object) -> Answer {
 /// A watch in progress.
 struct Following {
     entry: &'static Entry,
+    form: Form,
     selection: Selection,
     watcher: Watcher,
     /// What there was at the beginning and is not yet sent.
@@ -133,7 +137,7 @@ impl Following {
                 return;
             };
             if self.selection.matches(&stored) {
-                chunk.extend(line("ADDED", &stored.bytes));
+                chunk.extend(line("ADDED", &self.form.object(self.entry, &stored)));
             }
         }
     }
@@ -143,7 +147,7 @@ impl Following {
             Ok(events) => {
                 for event in events {
                     if let Some(kind) = kind(&self.selection, &event) {
-                        chunk.extend(line(kind, &event.object.bytes));
+                        chunk.extend(line(kind, &self.form.object(self.entry, &event.object)));
                     }
                 }
             }

@@ -137,11 +137,9 @@ mod tests {
             "apiVersion": "v1", "kind": "X", "spec": {"metadata": {"resourceVersion": "7"}, "text": "\"}é\u{0}"},
             "metadata": {"name": "n", "uid": "u", "labels": {"status": "{"}},
         });
-        let stored = |value: &Value, revision| Stored {
-            key: Key::cluster(Resource::new("xs"), "n"),
-            revision,
-            uid: "u".into(),
-            bytes: Template::new(value).unwrap().at(revision),
+        let stored = |value: &Value, revision| {
+            let bytes = Template::new(value).unwrap().at(revision);
+            Stored::new(Key::cluster(Resource::new("xs"), "n"), revision, "u".into(), bytes)
         };
         for status in [json!({"phase": "Bound"}), json!({}), json!(null)] {
             let raw = serde_json::value::to_raw_value(&status).unwrap();

@@ -41,11 +41,12 @@ mod watch;
 mod writer;
 
 use std::fmt;
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 
 use bytes::Bytes;
-use serde::Serialize;
+use muster_api::selector::Labels;
 use serde::de::DeserializeOwned;
+use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use serde_json::value::RawValue;
 
@@ -68,6 +69,8 @@ pub struct Stored {
     pub uid: Box<str>,
     /// The object as JSON, ready to be sent.
     pub bytes: Bytes,
+    /// Its labels, read once: a thousand watchers may each ask for them.
+    labels: OnceLock<Box<Labels>>,
 }
 
 impl fmt::Debug for Stored {
@@ -80,7 +83,34 @@ impl fmt::Debug for Stored {
     }
 }
 
+/// The part of an object that has its labels.
+#[derive(Deserialize)]
+struct Labelled {
+    metadata: LabelledMetadata,
+}
+
+#[derive(Deserialize)]
+struct LabelledMetadata {
+    #[serde(default)]
+    labels: Option<Labels>,
+}
+
 impl Stored {
+    /// An object at a revision.
+    #[must_use]
+    pub fn new(key: Key, revision: u64, uid: Box<str>, bytes: Bytes) -> Self {
+        Self { key, revision, uid, bytes, labels: OnceLock::new() }
+    }
+
+    /// Its labels.
+    #[must_use]
+    pub fn labels(&self) -> &Labels {
+        self.labels.get_or_init(|| {
+            let labels = self.parse::<Labelled>().ok().and_then(|object| object.metadata.labels);
+            Box::new(labels.unwrap_or_default())
+        })
+    }
+
     /// Whether a field of this name can be in the object. A cheap look at the text, so that most objects
     /// need not be read to see that they do not concern a caller; true may be a word of a value.
     #[must_use]

@@ -69,7 +69,7 @@ impl Pending {
                 // One allocation for the key parts of an object and its successors.
                 let key = present.map_or(key, |present| present.key.clone());
                 let bytes = template.at(revision);
-                let object = Arc::new(Stored { key, revision, uid: template.uid, bytes });
+                let object = Arc::new(Stored::new(key, revision, template.uid, bytes));
                 let previous = present.map(Arc::clone);
                 Ok(Some(Event { change: Change::Put, object, previous }))
             }
@@ -81,12 +81,8 @@ impl Pending {
                 };
                 let template = Template::new(&last.value())
                     .map_err(|reason| StoreError::Malformed { key, reason })?;
-                let object = Arc::new(Stored {
-                    key: last.key.clone(),
-                    revision,
-                    bytes: template.at(revision),
-                    uid: template.uid,
-                });
+                let bytes = template.at(revision);
+                let object = Arc::new(Stored::new(last.key.clone(), revision, template.uid, bytes));
                 Ok(Some(Event { change: Change::Delete, object, previous: Some(last) }))
             }
             Prepared::Check { key, precondition } => {

@@ -120,12 +120,8 @@ impl State {
         // One allocation for key parts of an object and its successors.
         let key = previous.as_ref().map_or(key, |previous| previous.key.clone());
         let change = if row.deleted { Change::Delete } else { Change::Put };
-        let object = Arc::new(Stored {
-            key,
-            revision: row.revision,
-            uid: row.uid.into(),
-            bytes: row.value.into_bytes().into(),
-        });
+        let bytes = row.value.into_bytes().into();
+        let object = Arc::new(Stored::new(key, row.revision, row.uid.into(), bytes));
         self.apply(Event { change, object, previous });
     }
 

@@ -11,7 +11,7 @@ use crate::stats::figure;
 const IDLE: Duration = Duration::from_secs(20);
 
 /// Resident memory of a process, MB (10⁶ bytes).
-fn rss(pid: u32) -> f64 {
+pub(crate) fn rss(pid: u32) -> f64 {
     let status = std::fs::read_to_string(format!("/proc/{pid}/status")).expect("it runs");
     let line = status.lines().find_map(|l| l.strip_prefix("VmRSS:")).expect("a resident size");
     let kib: f64 = line.trim().trim_end_matches("kB").trim().parse().expect("a number");

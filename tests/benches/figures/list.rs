@@ -30,10 +30,40 @@ pub(crate) async fn nodes() {
         assert_eq!(value["items"].as_array().map(Vec::len), Some(NODES));
         floor.push(encode_and_write(&value));
     }
+    let gets = gets_under_load(&client).await;
     println!("  {NODES} nodes are {:.1} MB", size as f64 / 1e6);
     floor.line("floor: encode + loopback write");
     ours.line("GET, until the last byte");
+    figure("list, p99", ours.quantile(0.99).as_secs_f64() * 1e3, " ms", "<= 100 ms on two cores");
+    gets.line("GET of one, while lists are sent");
+    figure("get, p99", gets.quantile(0.99).as_secs_f64() * 1e3, " ms", "<= 5 ms");
     figure("p50 ratio", ours.median().as_secs_f64() / floor.median().as_secs_f64(), "x", "<= 2x");
+}
+
+/// Gets of one node, one after the other, while another client lists them all over and over.
+async fn gets_under_load(client: &kube::Client) -> Samples {
+    let (mut gets, done) = (Samples::default(), std::cell::Cell::new(false));
+    let lists = async {
+        for _ in 0..ROUNDS {
+            let request = Request::get("/apis/muster.dev/v1alpha1/nodes").body(Vec::new());
+            client.request_text(request.expect("a request")).await.expect("a list");
+        }
+        done.set(true);
+    };
+    let single = async {
+        for i in (0..NODES).cycle() {
+            if done.get() {
+                return;
+            }
+            let path = format!("/apis/muster.dev/v1alpha1/nodes/robot-{i:05}");
+            let request = Request::get(path).body(Vec::new()).expect("a request");
+            let begin = Instant::now();
+            client.request_text(request).await.expect("a node");
+            gets.push(begin.elapsed());
+        }
+    };
+    futures::future::join(lists, single).await;
+    gets
 }
 
 /// Creates nodes as agents would have reported them.

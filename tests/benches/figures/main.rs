@@ -14,6 +14,7 @@ mod ros;
 mod stats;
 mod stops;
 mod submit;
+mod watchers;
 mod writes;
 
 use std::process::ExitCode;
@@ -40,6 +41,9 @@ const FIGURES: &[Figure] = &[
     }),
     ("list", "list of 10 000 nodes, against encoding it and a loopback write", || {
         Box::pin(list::nodes())
+    }),
+    ("watchers", "1 020 watchers, most on 1/100 of the objects, under 500 writes/s", || {
+        Box::pin(watchers::all())
     }),
     ("poses", "poses of 10 000 robots over 100 streams on one core, against a bare stream", || {
         Box::pin(poses::all())

@@ -50,6 +50,7 @@ pub struct NodeSpec {
     pub unschedulable: bool,
     /// Marks that keep tasks away which do not tolerate them.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    #[schemars(extend("x-kubernetes-list-type" = "map", "x-kubernetes-list-map-keys" = ["key", "effect"]))]
     pub taints: Vec<Taint>,
     /// Usual speed of a robot, metres per second; the cost `TravelTime` needs it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -176,6 +177,7 @@ pub struct NodeStatus {
     /// Facts about the node; `Ready`, `Fenced`, `Battery` and `Maintenance` are the controller's, the others are the
     /// agent's.
     #[serde(skip_serializing_if = "Vec::is_empty")]
+    #[schemars(extend("x-kubernetes-list-type" = "map", "x-kubernetes-list-map-keys" = ["type"]))]
     pub conditions: Vec<Condition>,
     /// How tasks can be run there.
     #[serde(skip_serializing_if = "Vec::is_empty")]
@@ -285,6 +287,7 @@ pub(super) const INFO: KindInfo = KindInfo {
     namespaced: false,
     has_status: true,
     selectable: &["spec.kind", "spec.unschedulable"],
+    schema: |g| g.subschema_for::<Node>(),
     admit_body: |object, violations| admit_spec::<NodeSpec>(object, violations, rules),
     admit_change: kind_stays,
 };

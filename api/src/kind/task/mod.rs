@@ -10,7 +10,8 @@ mod tests;
 
 use std::collections::BTreeMap;
 
-use k8s_openapi::apimachinery::pkg::apis::meta::v1::MicroTime;
+use jiff::Timestamp;
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::{MicroTime, Time};
 use kube::CustomResource;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -20,6 +21,7 @@ pub use reschedule::{EarlierTry, Outlook, Over, Reschedule};
 
 use super::node::{NodeKind, Taint, TaintEffect};
 use super::{KindInfo, admit_spec};
+use crate::condition::{self, Condition};
 use crate::duration::Span;
 use crate::id::Epoch;
 use crate::name::FunctionName;
@@ -81,6 +83,7 @@ pub struct TaskSpec {
     /// Tasks that must have come so far before an attempt of this one begins, also after a reboot of its node. Until all
     /// have, it is not placed.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    #[schemars(extend("x-kubernetes-list-type" = "map", "x-kubernetes-list-map-keys" = ["task"]))]
     pub depends_on: Vec<depend::DependsOn>,
     /// How long the task may be on its node, seconds from when it was placed; then it is stopped, and has Failed with
     /// the reason DeadlineExceeded. The controller keeps the time: a node without contact is told when it is back. With
@@ -265,9 +268,11 @@ pub struct Resources {
     pub pids: Option<u64>,
     /// SR: sensor functions, shared with others.
     #[serde(skip_serializing_if = "Vec::is_empty")]
+    #[schemars(extend("x-kubernetes-list-type" = "set"))]
     pub sensors: Vec<FunctionName>,
     /// AR: actuator functions, for this task alone.
     #[serde(skip_serializing_if = "Vec::is_empty")]
+    #[schemars(extend("x-kubernetes-list-type" = "set"))]
     pub actuators: Vec<FunctionName>,
 }
 
@@ -359,18 +364,21 @@ pub struct ContainerRun {
     pub args: Vec<String>,
     /// Environment.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    #[schemars(extend("x-kubernetes-list-type" = "map", "x-kubernetes-list-map-keys" = ["name"]))]
     pub env: Vec<EnvVar>,
     /// Whole ConfigMaps and Secrets as environment.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub env_from: Vec<EnvFrom>,
     /// ConfigMaps and Secrets as files.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    #[schemars(extend("x-kubernetes-list-type" = "map", "x-kubernetes-list-map-keys" = ["mountPath"]))]
     pub files: Vec<Files>,
     /// Working directory in the container.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub working_dir: Option<String>,
     /// Directories of the node that the container sees.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    #[schemars(extend("x-kubernetes-list-type" = "map", "x-kubernetes-list-map-keys" = ["mountPath"]))]
     pub mounts: Vec<Mount>,
     /// The container's network.
     #[serde(default)]
@@ -392,12 +400,14 @@ pub struct ProcessRun {
     pub args: Vec<String>,
     /// Environment, beside the agent's PATH and the MUSTER_ variables.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    #[schemars(extend("x-kubernetes-list-type" = "map", "x-kubernetes-list-map-keys" = ["name"]))]
     pub env: Vec<EnvVar>,
     /// Whole ConfigMaps and Secrets as environment.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub env_from: Vec<EnvFrom>,
     /// ConfigMaps and Secrets as files.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    #[schemars(extend("x-kubernetes-list-type" = "map", "x-kubernetes-list-map-keys" = ["mountPath"]))]
     pub files: Vec<Files>,
     /// Working directory; none: a directory of the task's own.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -516,7 +526,7 @@ impl TaskSpec {
 
 /// What has become of a task.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(rename_all = "camelCase", default)]
+#[serde(rename_all = "camelCase", default, remote = "Self")]
 pub struct TaskStatus {
     /// Where it is in its life.
     pub phase: TaskPhase,
@@ -589,9 +599,62 @@ pub struct TaskStatus {
     /// It is not placed before.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub not_before: Option<MicroTime>,
+    /// `Placed`, `Ready`; of a task that has ended `Complete` or `Failed`. They follow from the other fields: they are
+    /// written whenever those are, and not read back (see [`TaskStatus::conditions`]).
+    #[serde(skip_deserializing, skip_serializing_if = "Vec::is_empty")]
+    #[schemars(extend("x-kubernetes-list-type" = "map", "x-kubernetes-list-map-keys" = ["type"]))]
+    pub conditions: Vec<Condition>,
+}
+
+impl Serialize for TaskStatus {
+    fn serialize<S: serde::Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        // The derived function, with what follows from the rest.
+        let shown = TaskStatus { conditions: self.conditions(), ..self.clone() };
+        TaskStatus::serialize(&shown, serializer)
+    }
+}
+
+impl<'de> Deserialize<'de> for TaskStatus {
+    fn deserialize<D: serde::Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        TaskStatus::deserialize(deserializer)
+    }
 }
 
 impl TaskStatus {
+    /// What the status says, as conditions: for clients that wait for these.
+    #[must_use]
+    pub fn conditions(&self) -> Vec<Condition> {
+        let since = |time: &Option<MicroTime>| {
+            time.as_ref().map(|t| Time(Timestamp::from_second(t.0.as_second()).unwrap_or(t.0)))
+        };
+        let of = |r#type: &str, holds: bool, reason: &str, time: &Option<MicroTime>| Condition {
+            last_transition_time: since(time),
+            ..Condition::new(r#type, holds, reason, "")
+        };
+        let ready = self.is_ready();
+        let reason =
+            if ready || !self.reason.is_empty() { &*self.reason } else { self.phase.as_str() };
+        let times = if ready {
+            [&self.ready_at, &self.started_at]
+        } else {
+            [&self.finished_at, &self.bound_at]
+        };
+        let [first, second] = times;
+        let time = if first.is_some() { first } else { second };
+        let mut conditions = vec![
+            of(PLACED, self.node.is_some(), "", &self.bound_at),
+            of(condition::READY, ready, reason, time),
+        ];
+        match self.phase {
+            TaskPhase::Succeeded => {
+                conditions.push(of(COMPLETE, true, &self.reason, &self.finished_at))
+            }
+            TaskPhase::Failed => conditions.push(of(FAILED, true, &self.reason, &self.finished_at)),
+            _ => {}
+        }
+        conditions
+    }
+
     /// Whether the task serves: it runs, and its probes, if it has some, say so.
     #[must_use]
     pub fn is_ready(&self) -> bool {
@@ -629,6 +692,13 @@ pub struct StopOrder {
     /// When it was given.
     pub at: MicroTime,
 }
+
+/// Condition of a task that is on a node.
+pub const PLACED: &str = "Placed";
+/// Condition of a task that has ended with success.
+pub const COMPLETE: &str = "Complete";
+/// Condition of a task that has ended without success.
+pub const FAILED: &str = "Failed";
 
 /// Reason of a task that waits until others have ended to make room for it.
 pub const PREEMPTING: &str = "Preempting";
@@ -690,6 +760,7 @@ pub(super) const INFO: KindInfo = KindInfo {
     namespaced: true,
     has_status: true,
     selectable: &["status.phase", "status.node", "spec.placement.node", "spec.priority"],
+    schema: |g| g.subschema_for::<Task>(),
     admit_body: |object, violations| admit_spec::<TaskSpec>(object, violations, rules::rules),
     admit_change: rules::change_rules,
 };

@@ -234,6 +234,7 @@ pub struct TaskSetStatus {
     pub selector: String,
     /// `Available`, `Progressing`.
     #[serde(skip_serializing_if = "Vec::is_empty")]
+    #[schemars(extend("x-kubernetes-list-type" = "map", "x-kubernetes-list-map-keys" = ["type"]))]
     pub conditions: Vec<Condition>,
 }
 
@@ -358,6 +359,7 @@ pub(super) const INFO: KindInfo = KindInfo {
     namespaced: true,
     has_status: true,
     selectable: &[],
+    schema: |g| g.subschema_for::<TaskSet>(),
     admit_body: rules::admit_body,
     admit_change: rules::change_rules,
 };

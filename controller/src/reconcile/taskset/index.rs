@@ -220,7 +220,7 @@ mod tests {
         let bytes = serde_json::to_vec(&object).expect("JSON").into();
         let key = Key::namespaced(TASKS, "lab", "watch-0");
         let mut index = Index::default();
-        index.take_in(Change::Put, &Arc::new(Stored { key, revision: 1, uid: "u".into(), bytes }));
+        index.take_in(Change::Put, &Arc::new(Stored::new(key, 1, "u".into(), bytes)));
         let set = Key::namespaced(TASK_SETS, "lab", "watch");
         let taken: Vec<String> = index.names(&set, &[], |_| true).into_iter().collect();
         assert_eq!(taken, ["watch-0"]);

@@ -2,12 +2,12 @@
 
 use std::time::Duration;
 
+use crate::pose::{DEFAULT_MAP, OperationPosition};
+use crate::quantity::{Bytes, MilliCpu};
 use jiff::Timestamp;
-use muster_api::pose::{DEFAULT_MAP, OperationPosition};
-use muster_api::quantity::{Bytes, MilliCpu};
 
 /// A span of time in its one or two largest units, as kubectl writes it: `45s`, `4m12s`, `3h`, `9d`.
-pub(crate) fn duration(span: Duration) -> String {
+pub fn duration(span: Duration) -> String {
     const MINUTE: u64 = 60;
     const HOUR: u64 = 60 * MINUTE;
     const DAY: u64 = 24 * HOUR;
@@ -30,19 +30,19 @@ pub(crate) fn duration(span: Duration) -> String {
 }
 
 /// What is left of a span that began at `since`; whole seconds.
-pub(crate) fn left(span: Duration, since: Timestamp, now: Timestamp) -> String {
+pub fn left(span: Duration, since: Timestamp, now: Timestamp) -> String {
     let gone = now.as_second().saturating_sub(since.as_second()).max(0);
     duration(span.saturating_sub(Duration::from_secs(gone.unsigned_abs())))
 }
 
 /// How long ago `then` was; whole seconds, and never negative: clocks differ.
-pub(crate) fn age(then: Timestamp, now: Timestamp) -> String {
+pub fn age(then: Timestamp, now: Timestamp) -> String {
     let seconds = now.as_second().saturating_sub(then.as_second()).max(0);
     duration(Duration::from_secs(seconds.unsigned_abs()))
 }
 
 /// An amount of memory with one digit after the point where that says more: `3.8Gi`, `64Mi`.
-pub(crate) fn bytes(amount: Bytes) -> String {
+pub fn bytes(amount: Bytes) -> String {
     for (shift, unit) in [(40, "Ti"), (30, "Gi"), (20, "Mi"), (10, "Ki")] {
         let one = 1_u64 << shift;
         if amount.0 >= one {
@@ -54,19 +54,19 @@ pub(crate) fn bytes(amount: Bytes) -> String {
 }
 
 /// An amount of cpu in cores: `0.25`, `1.5`, `2`.
-pub(crate) fn cores(amount: MilliCpu) -> String {
+pub fn cores(amount: MilliCpu) -> String {
     format!("{}", amount.cores())
 }
 
 /// A place in a cell, as poses are written: metres, and the map where it is not the usual one.
-pub(crate) fn place(at: &OperationPosition) -> String {
+pub fn place(at: &OperationPosition) -> String {
     let z = if at.z == 0.0 { String::new() } else { format!(",{:.2}", at.z) };
     let map = if at.map == DEFAULT_MAP { String::new() } else { format!(" in {}", at.map) };
     format!("{:.2},{:.2}{z}{map}", at.x, at.y)
 }
 
 /// `part` of `whole` in percent; `-` of nothing.
-pub(crate) fn percent(part: u64, whole: u64) -> String {
+pub fn percent(part: u64, whole: u64) -> String {
     if whole == 0 {
         return "-".to_owned();
     }
@@ -74,13 +74,13 @@ pub(crate) fn percent(part: u64, whole: u64) -> String {
 }
 
 /// `1 task`, `3 tasks`.
-pub(crate) fn count(n: usize, word: &str) -> String {
+pub fn count(n: usize, word: &str) -> String {
     if n == 1 { format!("1 {word}") } else { format!("{n} {word}s") }
 }
 
 /// Text from elsewhere on one line: line ends become spaces, other control characters (which could
 /// move the cursor of a terminal) become `U+FFFD`.
-pub(crate) fn plain(text: &str) -> String {
+pub fn plain(text: &str) -> String {
     text.chars()
         .map(|c| match c {
             '\n' | '\r' | '\t' => ' ',
@@ -91,12 +91,12 @@ pub(crate) fn plain(text: &str) -> String {
 }
 
 /// Text from elsewhere with its lines kept, the later ones indented.
-pub(crate) fn lines(text: &str) -> String {
+pub fn lines(text: &str) -> String {
     text.lines().map(plain).collect::<Vec<_>>().join("\n  ")
 }
 
 /// The text, or `-` when there is none.
-pub(crate) fn or_dash(text: &str) -> String {
+pub fn or_dash(text: &str) -> String {
     if text.is_empty() { "-".to_owned() } else { plain(text) }
 }
 

@@ -1,11 +1,11 @@
 //! Leases: who drives.
 
-use muster_api::kind::lease::{Lease, LeaseStatus};
+use crate::kind::lease::{Lease, LeaseStatus};
 
+use super::Cell;
 use super::Column;
-use crate::output::human;
-use crate::output::style::Mood;
-use crate::output::table::Cell;
+use super::Mood;
+use super::human;
 
 pub(super) const COLUMNS: &[Column<Lease>] = &[
     Column::new("NODE", |lease, _| lease.spec.node.as_str().into()),
@@ -23,7 +23,7 @@ pub(super) const COLUMNS: &[Column<Lease>] = &[
     }),
     Column::wide("ACTUATORS", |lease, _| {
         let all = lease.spec.actuators.iter().cloned().collect();
-        muster_api::resource::format_function_list(&all).into()
+        crate::resource::format_function_list(&all).into()
     }),
 ];
 

@@ -1,7 +1,7 @@
 //! ConfigMaps and Secrets: how many keys, never what stands under them.
 
-use muster_api::kind::config_map::ConfigMap;
-use muster_api::kind::secret::Secret;
+use crate::kind::config_map::ConfigMap;
+use crate::kind::secret::Secret;
 
 use super::{Column, age};
 

@@ -1,12 +1,12 @@
 //! Frameworks: who is there, where it works, what it has.
 
-use muster_api::kind::framework::{Framework, FrameworkStatus, OfferFilter};
-use muster_api::kind::task::NodeChoice;
+use crate::kind::framework::{Framework, FrameworkStatus, OfferFilter};
+use crate::kind::task::NodeChoice;
 
+use super::Cell;
+use super::Mood;
+use super::human;
 use super::{Column, age};
-use crate::output::human;
-use crate::output::style::Mood;
-use crate::output::table::Cell;
 
 pub(super) const COLUMNS: &[Column<Framework>] = &[
     Column::new("CONNECTED", |framework, _| connected(framework)),
@@ -41,12 +41,12 @@ fn connected(framework: &Framework) -> Cell {
 }
 
 /// A weighted share. No percentage: with a weight below 1 it may be above 1.
-pub(crate) fn share(value: f64) -> String {
+pub fn share(value: f64) -> String {
     format!("{value:.2}")
 }
 
 /// What the filter asks for, a part each; none: everything passes.
-pub(crate) fn filter(filter: &OfferFilter) -> Vec<String> {
+pub fn filter(filter: &OfferFilter) -> Vec<String> {
     let OfferFilter { on, selector, minimum, sensors, actuators, any_actuator, most } = filter;
     let mut parts = Vec::new();
     if *on != NodeChoice::Any {
@@ -70,53 +70,4 @@ pub(crate) fn filter(filter: &OfferFilter) -> Vec<String> {
         parts.push(format!("most {most}"));
     }
     parts
-}
-
-#[cfg(test)]
-mod tests {
-    use jiff::Timestamp;
-    use serde_json::json;
-
-    use crate::output::columns::{Layout, table};
-    use crate::output::style::Styles;
-
-    #[test]
-    fn a_framework_shows_where_it_works_and_what_it_has() {
-        let info = muster_api::kind::find_by_word("fw").expect("served");
-        let framework = |name: &str, spec, status| {
-            json!({
-                "apiVersion": "muster.dev/v1alpha1", "kind": "Framework",
-                "metadata": {"name": name, "uid": "u-1", "creationTimestamp": "1970-01-01T00:00:00Z"},
-                "spec": spec, "status": status,
-            })
-        };
-        let objects = [
-            framework(
-                "deliver",
-                json!({
-                    "position": {"x": 3, "y": 4.5}, "radius": 8.5,
-                    "filter": {"on": "Robot", "minimum": {"cpu": "500m"}, "anyActuator": true, "most": 2},
-                }),
-                json!({"connected": true, "offers": 2, "tasks": 1, "share": 0.25}),
-            ),
-            framework("idle", json!({}), json!({"connected": true, "suppressed": true})),
-            framework("lost", json!({"failoverTimeout": "5m"}), json!({"connected": false})),
-        ];
-        let text = |wide| {
-            let now = Timestamp::from_second(65).expect("in range");
-            let layout = Layout { wide, namespaces: false, kinds: false, now };
-            table(info, &objects, layout).text(&Styles::default())
-        };
-        assert_eq!(
-            text(false),
-            "NAME      CONNECTED         POSITION    RADIUS   OFFERS   TASKS   SHARE   AGE\n\
-             deliver   True              3.00,4.50   8.5m     2        1       0.25    65s\n\
-             idle      True,Suppressed   -           -        0        0       0.00    65s\n\
-             lost      False             -           -        0        0       0.00    65s\n"
-        );
-        let wide = text(true);
-        for part in ["FILTER", "Robot; cpu≥0.5; any actuator; most 2", "5m", "u-1"] {
-            assert!(wide.contains(part), "{part:?} is not in\n{wide}");
-        }
-    }
 }

@@ -1,13 +1,13 @@
 //! Events, as kubectl shows them.
 
+use crate::kind::event::Event;
 use jiff::Timestamp;
-use muster_api::kind::event::Event;
 use serde_json::Value;
 
+use super::Cell;
+use super::Mood;
+use super::human;
 use super::{Column, age};
-use crate::output::human;
-use crate::output::style::Mood;
-use crate::output::table::Cell;
 
 pub(super) const COLUMNS: &[Column<Event>] = &[
     Column::new("SEEN", seen),
@@ -26,7 +26,7 @@ pub(super) const COLUMNS: &[Column<Event>] = &[
 ];
 
 /// When it happened last. Newer clients write `eventTime`, older ones `lastTimestamp`.
-pub(crate) fn stamp(event: &Event) -> Option<Timestamp> {
+pub fn stamp(event: &Event) -> Option<Timestamp> {
     let last = event.last_timestamp.as_ref().map(|t| t.0);
     let series = event.series.as_ref().and_then(|s| s.last_observed_time.as_ref()).map(|t| t.0);
     let once = event.event_time.as_ref().map(|t| t.0);
@@ -34,7 +34,7 @@ pub(crate) fn stamp(event: &Event) -> Option<Timestamp> {
 }
 
 /// Newest last: that is where the eye is after a command.
-pub(super) fn by_time(objects: &[Value]) -> Vec<Value> {
+pub fn by_time(objects: &[Value]) -> Vec<Value> {
     let mut sorted = objects.to_vec();
     let of = |o: &Value| serde_json::from_value(o.clone()).ok().and_then(|e: Event| stamp(&e));
     sorted.sort_by_cached_key(of);

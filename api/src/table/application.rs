@@ -1,12 +1,10 @@
 //! Applications: whose they are, and what of them may move.
 
-use muster_api::condition::MANAGED;
-use muster_api::kind::application::pin::pins;
-use muster_api::kind::application::{Application, Policy};
+use crate::condition::MANAGED;
+use crate::kind::application::pin::pins;
+use crate::kind::application::{Application, Policy};
 
-use super::{Column, age};
-use crate::output::style::Mood;
-use crate::output::table::Cell;
+use super::{Cell, Column, Mood, age};
 
 pub(super) const COLUMNS: &[Column<Application>] = &[
     Column::new("HOME", |app, _| app.spec.home.as_str().into()),
@@ -36,7 +34,9 @@ fn away(app: &Application) -> Cell {
     placed.iter().filter(|scale| ***scale != app.spec.home).count().to_string().into()
 }
 
-pub(crate) fn policy(policy: Policy) -> &'static str {
+/// How the mapping is chosen, in a word.
+#[must_use]
+pub fn policy(policy: Policy) -> &'static str {
     match policy {
         Policy::Optimal => "Optimal",
         Policy::Greedy => "Greedy",
@@ -47,30 +47,4 @@ pub(crate) fn policy(policy: Policy) -> &'static str {
 fn managed(app: &Application) -> Cell {
     let condition = app.status.as_ref().and_then(|s| s.condition(MANAGED));
     condition.map_or_else(|| Cell::from(""), |c| Cell::new(format!("{:?}", c.status), Mood::Plain))
-}
-
-#[cfg(test)]
-mod tests {
-    use serde_json::json;
-
-    use crate::output::columns::{Layout, table};
-    use crate::output::style::Styles;
-
-    #[test]
-    fn a_row_says_what_may_move() {
-        let info = muster_api::kind::find_by_word("app").expect("served");
-        let now = jiff::Timestamp::UNIX_EPOCH;
-        let layout = Layout { wide: false, namespaces: false, kinds: false, now };
-        let part = |name: &str, sensors: serde_json::Value| json!({"name": name, "template": {"spec": {"resources": {"sensors": sensors}}}});
-        let object = json!({
-            "apiVersion": "muster.dev/v1alpha1", "kind": "Application", "metadata": {"name": "corridor"},
-            "spec": {"home": "youbot", "parts": [part("camera", json!(["x:Y"])), part("amcl", json!([]))]},
-            "status": {"conditions": [{"type": "Managed", "status": "False"}]},
-        });
-        assert_eq!(
-            table(info, &[object], layout).text(&Styles::default()),
-            "NAME       HOME     PARTS   MIGRATABLE   AWAY   POLICY    MANAGED   AGE\n\
-             corridor   youbot   2       amcl         -      Optimal   False     -\n"
-        );
-    }
 }

@@ -1,11 +1,11 @@
 //! Sets of tasks: how many there should be, are, and serve.
 
-use muster_api::condition::{ConditionStatus, PROGRESSING};
-use muster_api::kind::taskset::{TaskSet, TaskSetStatus};
+use crate::condition::{ConditionStatus, PROGRESSING};
+use crate::kind::taskset::{TaskSet, TaskSetStatus};
 
+use super::Cell;
+use super::Mood;
 use super::{Column, age};
-use crate::output::style::Mood;
-use crate::output::table::Cell;
 
 pub(super) const COLUMNS: &[Column<TaskSet>] = &[
     Column::new("DESIRED", |set, _| desired(set).into()),
@@ -27,7 +27,7 @@ pub(super) const COLUMNS: &[Column<TaskSet>] = &[
 ];
 
 /// `3`, or `each node` when nobody has counted them yet.
-pub(crate) fn desired(set: &TaskSet) -> String {
+pub fn desired(set: &TaskSet) -> String {
     match (set.spec.replicas, &set.status) {
         (Some(replicas), _) => replicas.to_string(),
         (None, Some(status)) => status.desired_replicas.to_string(),
@@ -49,7 +49,7 @@ fn available(set: &TaskSet) -> Cell {
 }
 
 /// Why the rollout is where it is.
-pub(crate) fn rollout(status: Option<&TaskSetStatus>) -> Cell {
+pub fn rollout(status: Option<&TaskSetStatus>) -> Cell {
     let Some(said) = status.and_then(|s| s.condition(PROGRESSING)) else { return Cell::from("") };
     let mood = match (said.status, said.reason.as_str()) {
         (ConditionStatus::False, _) => Mood::Bad,
@@ -57,31 +57,4 @@ pub(crate) fn rollout(status: Option<&TaskSetStatus>) -> Cell {
         _ => Mood::Warn,
     };
     Cell::new(&said.reason, mood)
-}
-
-#[cfg(test)]
-mod tests {
-    use serde_json::json;
-
-    use crate::fake::taskset;
-    use crate::output::columns::{Layout, table};
-    use crate::output::style::Styles;
-
-    #[test]
-    fn a_row_says_how_many_serve_and_what_the_rollout_does() {
-        let info = muster_api::kind::find_by_word("ts").expect("served");
-        let now = jiff::Timestamp::UNIX_EPOCH;
-        let layout = Layout { wide: false, namespaces: false, kinds: false, now };
-        let status = json!({
-            "desiredReplicas": 3, "replicas": 3, "updatedReplicas": 1, "availableReplicas": 2, "unavailableReplicas": 1,
-            "conditions": [{"type": "Progressing", "status": "True", "reason": "Canary"}],
-        });
-        assert_eq!(
-            table(info, &[taskset("a", status), taskset("b", json!(null))], layout)
-                .text(&Styles::default()),
-            "NAME   DESIRED   CURRENT   UPDATED   AVAILABLE   ROLLOUT   AGE\n\
-             a      3         3         1         2           Canary    -\n\
-             b      3         -         -         -           -         -\n"
-        );
-    }
 }

@@ -1,6 +1,6 @@
 //! Namespaces.
 
-use muster_api::kind::namespace::Namespace;
+use crate::kind::namespace::Namespace;
 
 use super::{Column, age};
 

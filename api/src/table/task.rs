@@ -1,12 +1,12 @@
 //! Tasks: how far each is, where, and why not further.
 
-use muster_api::kind::task::{Cost, NodeRefusal, Task, TaskSpec, TaskStatus};
-use muster_api::phase::TaskPhase;
+use crate::kind::task::{Cost, NodeRefusal, Task, TaskSpec, TaskStatus};
+use crate::phase::TaskPhase;
 
+use super::Cell;
+use super::Mood;
+use super::human;
 use super::{Column, age};
-use crate::output::human;
-use crate::output::style::Mood;
-use crate::output::table::Cell;
 
 pub(super) const COLUMNS: &[Column<Task>] = &[
     Column::new("PHASE", |task, _| phase(task)),
@@ -33,7 +33,7 @@ fn status(task: &Task, text: impl Fn(&TaskStatus) -> String) -> Cell {
 }
 
 /// What a phase means to the reader.
-pub(crate) fn mood(phase: TaskPhase) -> Mood {
+pub fn mood(phase: TaskPhase) -> Mood {
     match phase {
         TaskPhase::Running => Mood::Good,
         TaskPhase::Succeeded => Mood::Dim,
@@ -45,7 +45,7 @@ pub(crate) fn mood(phase: TaskPhase) -> Mood {
 }
 
 /// Whether a running task serves; of others nothing is said.
-pub(crate) fn ready(status: &TaskStatus) -> Option<&'static str> {
+pub fn ready(status: &TaskStatus) -> Option<&'static str> {
     let runs = status.phase == TaskPhase::Running;
     runs.then(|| if status.is_ready() { "True" } else { "False" })
 }
@@ -66,7 +66,7 @@ pub(crate) fn attempts(spec: &TaskSpec, status: &TaskStatus) -> String {
 }
 
 /// A score with its unit.
-pub(crate) fn score(value: f64, cost: Cost) -> String {
+pub fn score(value: f64, cost: Cost) -> String {
     match cost {
         Cost::Distance => format!("{value:.2}m"),
         Cost::TravelTime => format!("{value:.1}s"),
@@ -74,7 +74,7 @@ pub(crate) fn score(value: f64, cost: Cost) -> String {
 }
 
 /// The reason of the phase; of a waiting task, the filters that refuse it and on how many nodes.
-pub(crate) fn reason(status: &TaskStatus) -> String {
+pub fn reason(status: &TaskStatus) -> String {
     if status.phase == TaskPhase::Pending && !status.why.is_empty() {
         return refusals(&status.why);
     }
@@ -82,7 +82,7 @@ pub(crate) fn reason(status: &TaskStatus) -> String {
 }
 
 /// `LeaseHeld×2,OutOfRange`: most frequent first.
-pub(crate) fn refusals(why: &[NodeRefusal]) -> String {
+pub fn refusals(why: &[NodeRefusal]) -> String {
     let mut counts: Vec<(&str, usize)> = Vec::new();
     for refusal in why {
         match counts.iter_mut().find(|(reason, _)| *reason == refusal.reason) {
@@ -121,93 +121,10 @@ fn of_reserved(used: Option<String>, reserved: Option<String>) -> String {
 }
 
 /// How the last attempt that ended ended.
-pub(crate) fn exit(status: &TaskStatus) -> String {
+pub fn exit(status: &TaskStatus) -> String {
     match (status.signal, status.exit_code) {
         (Some(signal), _) => format!("signal {signal}"),
         (None, Some(code)) => code.to_string(),
         (None, None) => String::new(),
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use jiff::Timestamp;
-    use serde_json::{Value, json};
-
-    use crate::output::columns::{Layout, table};
-    use crate::output::style::Styles;
-
-    fn task(name: &str, resources: Value, status: Value) -> Value {
-        json!({
-            "apiVersion": "muster.dev/v1alpha1", "kind": "Task",
-            "metadata": {"name": name, "namespace": "lab", "creationTimestamp": "1970-01-01T00:00:00Z"},
-            "spec": {"resources": resources, "run": {"process": {"command": ["x"]}}},
-            "status": status,
-        })
-    }
-
-    fn text(wide: bool, namespaces: bool) -> String {
-        let info = muster_api::kind::find_by_word("task").expect("served");
-        let refusal =
-            |node: &str, reason: &str| json!({"node": node, "reason": reason, "message": "m"});
-        let objects = [
-            task(
-                "gmapping",
-                json!({"cpu": "500m", "memory": "64Mi", "sensors": ["k:L"], "actuators": ["b:D"]}),
-                json!({"phase": "Running", "node": "r1", "score": 2.345, "attempt": 1,
-                       "lease": {"name": "r1.body", "epoch": 4}, "usage": {"cpu": "153m", "memory": "12Mi"}}),
-            ),
-            task(
-                "second",
-                json!({"actuators": ["b:D"]}),
-                json!({"phase": "Pending", "attempt": 0,
-                       "why": [refusal("c1", "WrongKind"), refusal("r1", "LeaseHeld"), refusal("r2", "LeaseHeld")]}),
-            ),
-            task(
-                "crash",
-                json!({}),
-                json!({"phase": "Failed", "node": "c1", "attempt": 3, "exitCode": 137, "signal": 9,
-                       "reason": "OOMKilled", "message": "out of memory"}),
-            ),
-        ];
-        let now = Timestamp::from_second(300).expect("in range");
-        table(info, &objects, Layout { wide, namespaces, kinds: false, now })
-            .text(&Styles::default())
-    }
-
-    #[test]
-    fn the_plain_table_says_where_and_why() {
-        assert_eq!(
-            text(false, true),
-            "NAMESPACE   NAME       PHASE     NODE   SCORE   CLASS      ATTEMPT   AGE   REASON\n\
-             lab         gmapping   Running   r1     2.35m   AR-CR-SR   1         5m    -\n\
-             lab         second     Pending   -      -       AR         -         5m    LeaseHeld×2,WrongKind\n\
-             lab         crash      Failed    c1     -       none       3         5m    OOMKilled\n"
-        );
-    }
-
-    #[test]
-    fn the_wide_table_adds_readiness_lease_usage_and_end() {
-        let text = text(true, false);
-        let squeezed: Vec<String> =
-            text.lines().map(|l| l.split_whitespace().collect::<Vec<_>>().join(" ")).collect();
-        assert_eq!(
-            squeezed[1],
-            "gmapping Running r1 2.35m AR-CR-SR 1 5m - True 4 0.153/0.5 12Mi/64Mi - -"
-        );
-        assert_eq!(
-            squeezed[3],
-            "crash Failed c1 - none 3 5m OOMKilled - - - - signal 9 out of memory"
-        );
-    }
-
-    #[test]
-    fn an_object_of_a_newer_controller_keeps_its_row() {
-        let info = muster_api::kind::find_by_word("task").expect("served");
-        let object = task("new", json!({}), json!({"phase": "Dreaming"}));
-        let layout =
-            Layout { wide: false, namespaces: false, kinds: true, now: Timestamp::UNIX_EPOCH };
-        let text = table(info, &[object], layout).text(&Styles::default());
-        assert!(text.lines().nth(1).expect("a row").starts_with("task/new   ?"), "{text}");
     }
 }

@@ -1,7 +1,7 @@
 //! Revisions of sets.
 
-use muster_api::kind::taskset::{CHANGE_CAUSE, SET_LABEL};
-use muster_api::kind::taskset_revision::TaskSetRevision;
+use crate::kind::taskset::{CHANGE_CAUSE, SET_LABEL};
+use crate::kind::taskset_revision::TaskSetRevision;
 
 use super::{Column, age};
 

@@ -1,17 +1,17 @@
 //! Nodes: can it take tasks, what is left of it, who drives it, where it is.
 
-use muster_api::condition::ConditionStatus;
-use muster_api::kind::node::upkeep::{
+use crate::condition::ConditionStatus;
+use crate::kind::node::upkeep::{
     BATTERY_LOW_TAINT, Battery, DISK_PRESSURE_TAINT, MAINTENANCE_TAINT, passing_taints,
 };
-use muster_api::kind::node::{Node, NodeStatus};
-use muster_api::name::FunctionName;
-use muster_api::resource::{Compute, format_function_list};
+use crate::kind::node::{Node, NodeStatus};
+use crate::name::FunctionName;
+use crate::resource::{Compute, format_function_list};
 
+use super::Cell;
+use super::Mood;
+use super::human;
 use super::{Column, age};
-use crate::output::human;
-use crate::output::style::Mood;
-use crate::output::table::Cell;
 
 pub(super) const COLUMNS: &[Column<Node>] = &[
     Column::new("KIND", |node, _| format!("{:?}", node.spec.kind).into()),
@@ -51,7 +51,7 @@ fn of_compute(node: &Node, text: impl Fn(&Compute, &Compute) -> String) -> Cell 
 
 /// Whether the node takes tasks now. `cordoned` and readiness are two things, and both are shown.
 fn ready(node: &Node) -> Cell {
-    let condition = node.status.as_ref().and_then(|s| s.condition(muster_api::condition::READY));
+    let condition = node.status.as_ref().and_then(|s| s.condition(crate::condition::READY));
     let (text, mood) = match condition.map(|c| c.status) {
         Some(ConditionStatus::True) => ("True", Mood::Good),
         Some(ConditionStatus::False) => ("False", Mood::Bad),
@@ -84,7 +84,7 @@ fn battery(status: &NodeStatus) -> String {
 
 /// `gmapping` for the holder of the only group; with several groups `arm=grasp,body=-`.
 fn holders(status: &NodeStatus) -> String {
-    let of = |lease: &muster_api::kind::node::NodeLease| {
+    let of = |lease: &crate::kind::node::NodeLease| {
         lease
             .holder
             .as_ref()
@@ -118,60 +118,4 @@ fn runtimes(status: &NodeStatus) -> String {
     let usable: Vec<&str> =
         status.runtimes.iter().filter(|r| r.available).map(|r| r.name.as_str()).collect();
     usable.join(",")
-}
-
-#[cfg(test)]
-mod tests {
-    use jiff::Timestamp;
-    use serde_json::json;
-
-    use crate::output::columns::{Layout, table};
-    use crate::output::style::Styles;
-
-    #[test]
-    fn a_robot_shows_what_is_left_who_drives_and_where_it_is() {
-        let info = muster_api::kind::find_by_word("node").expect("served");
-        let robot = json!({
-            "apiVersion": "muster.dev/v1alpha1", "kind": "Node",
-            "metadata": {"name": "turtlebot-1", "creationTimestamp": "1970-01-01T00:00:00Z"},
-            "spec": {"kind": "Robot", "unschedulable": true},
-            "status": {
-                "allocatable": {"cpu": "2", "memory": "4Gi"},
-                "free": {"cpu": "1500m", "memory": "3Gi"},
-                "sensors": ["kinect:LaserGen", "kinect:ImageGen"],
-                "actuators": ["base:Drive"],
-                "leases": [{"group": "body", "epoch": 3, "holder": {"namespace": "default", "name": "gmapping", "uid": "u"}}],
-                "pose": {"x": 3, "y": 4.5},
-                "battery": {"percent": 9, "charging": true},
-                "conditions": [{"type": "Ready", "status": "True"}, {"type": "Battery", "status": "False"}],
-                "runtimes": [{"name": "process", "available": true}, {"name": "docker", "available": false}],
-                "agentVersion": "0.1.0",
-            },
-        });
-        let registered = json!({
-            "apiVersion": "muster.dev/v1alpha1", "kind": "Node",
-            "metadata": {"name": "cloud-1"}, "spec": {"kind": "Cloud"},
-        });
-        let layout = |wide| Layout {
-            wide,
-            namespaces: true,
-            kinds: false,
-            now: Timestamp::from_second(65).expect("in range"),
-        };
-        let text = |wide| {
-            table(info, &[robot.clone(), registered.clone()], layout(wide)).text(&Styles::default())
-        };
-        assert_eq!(
-            text(false),
-            "NAME          KIND    READY                      CPU     MEMORY    LEASE              POSE        AGE\n\
-             turtlebot-1   Robot   True,Cordoned,BatteryLow   1.5/2   3Gi/4Gi   default/gmapping   3.00,4.50   65s\n\
-             cloud-1       Cloud   NotJoined                  -       -         -                  -           -\n"
-        );
-        assert!(
-            text(true)
-                .contains("9 %+      kinect:ImageGen,LaserGen   base:Drive   process    0.1.0"),
-            "{}",
-            text(true)
-        );
-    }
 }

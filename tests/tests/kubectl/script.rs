@@ -1,0 +1,114 @@
+//! The golden script: `$ command` lines, each with what it prints (standard output, then standard error) and, when it is
+//! not 0, its exit code. `$1.27 command` needs a kubectl of that version; of older ones than 1.30 only success and failure
+//! are compared, because their words differ.
+
+use std::fmt::Write as _;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use muster_tests::{AgentOptions, Cluster};
+use serde_json::Value;
+
+use crate::redact::redact;
+
+struct Step {
+    since: u64,
+    command: String,
+    expected: String,
+}
+
+fn here() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/kubectl")
+}
+
+fn read(text: &str) -> Vec<Step> {
+    let mut steps: Vec<Step> = Vec::new();
+    for line in text.lines() {
+        if let Some(rest) = line.strip_prefix('$')
+            && let Some((since, command)) = rest.split_once(' ')
+        {
+            let since = since.strip_prefix("1.").and_then(|minor| minor.parse().ok()).unwrap_or(0);
+            steps.push(Step { since, command: command.to_owned(), expected: String::new() });
+        } else if let Some(step) = steps.last_mut() {
+            step.expected.push_str(line);
+            step.expected.push('\n');
+        }
+    }
+    steps
+}
+
+/// The minor version of the kubectl in the PATH.
+fn kubectl() -> u64 {
+    let output = Command::new("kubectl").args(["version", "--client", "-o", "json"]).output();
+    let output = output.expect("kubectl is installed (tests/run does)");
+    let version: Value = serde_json::from_slice(&output.stdout).expect("JSON");
+    let minor = version["clientVersion"]["minor"].as_str().unwrap_or_default();
+    minor.trim_end_matches('+').parse().expect("a number")
+}
+
+fn run(command: &str, dir: &Path, cluster: &Cluster) -> (bool, String) {
+    let output = Command::new("sh")
+        .args(["-c", command])
+        .current_dir(dir)
+        .env("KUBECONFIG", cluster.kubeconfig())
+        // Its cache of discovery is by server, and servers of tests come and go.
+        .env("HOME", dir)
+        .env_remove("EDITOR")
+        .output()
+        .expect("a shell");
+    let mut text = String::from_utf8_lossy(&output.stdout).into_owned();
+    text.push_str(&String::from_utf8_lossy(&output.stderr));
+    let mut text = redact(&text, &dir.display().to_string());
+    match output.status.code() {
+        Some(0) => {}
+        code => write!(text, "\nexit {}", code.unwrap_or(-1)).expect("a String"),
+    }
+    (output.status.success(), text.trim_start_matches('\n').to_owned())
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn stock_kubectl_says_what_the_script_says() {
+    let mut cluster = Cluster::start().await;
+    let size = |options: AgentOptions| options.flag("--cpu", "2").flag("--memory", "4Gi");
+    cluster.join(size(AgentOptions::robot("robot-1", 1.0, 2.0))).await;
+    cluster.join(size(AgentOptions::cloud("cloud-1"))).await;
+    let dir = cluster.dir().join("kubectl");
+    std::fs::create_dir(&dir).expect("a directory of the test's own");
+    for file in std::fs::read_dir(here().join("files")).expect("the manifests") {
+        let file = file.expect("a file").path();
+        std::fs::copy(&file, dir.join(file.file_name().expect("a name"))).expect("a copy");
+    }
+    let path = here().join("session.txt");
+    let text = std::fs::read_to_string(&path).expect("the script");
+    let (minor, writes) = (kubectl(), std::env::var("MUSTER_GOLDEN").is_ok_and(|v| v == "write"));
+    let (mut written, mut wrong) = (String::new(), String::new());
+    for step in read(&text) {
+        let since = if step.since == 0 { String::new() } else { format!("1.{}", step.since) };
+        writeln!(written, "${since} {}", step.command).expect("a String");
+        if step.since > minor {
+            continue;
+        }
+        // Before 1.27 kubectl reads only OpenAPI v2 and validates by it.
+        let says = |word: &&str| step.command.contains(&format!(" {word} "));
+        let sends = ["apply", "create", "replace"].iter().any(says) && !says(&"auth");
+        let old = minor < 27 && sends;
+        let command = match old {
+            true => format!("{} --validate=false", step.command),
+            false => step.command.clone(),
+        };
+        let (passed, said) = run(&command, &dir, &cluster);
+        writeln!(written, "{said}\n").expect("a String");
+        let expected = step.expected.trim_end();
+        let fails = expected.lines().last().is_some_and(|line| line.starts_with("exit "));
+        let right = if minor < 30 { passed != fails } else { said == expected };
+        if !right {
+            writeln!(wrong, "$ {command}\n--- expected\n{expected}\n--- said\n{said}")
+                .expect("a String");
+        }
+    }
+    if writes {
+        std::fs::write(&path, written).expect("the script is ours");
+    } else {
+        assert!(wrong.is_empty(), "{wrong}");
+    }
+}
