@@ -56,7 +56,8 @@ fn phase(task: &Task) -> Cell {
 }
 
 /// Which attempt it is; of a task that is tried on other nodes counted over all of them, and how many there may be.
-pub(crate) fn attempts(spec: &TaskSpec, status: &TaskStatus) -> String {
+#[must_use]
+pub fn attempts(spec: &TaskSpec, status: &TaskStatus) -> String {
     let attempt = status.attempts_used.saturating_add(status.attempt);
     match (&spec.reschedule, attempt) {
         (_, 0) => String::new(),

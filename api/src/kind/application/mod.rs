@@ -278,4 +278,5 @@ pub(super) const INFO: KindInfo = KindInfo {
     selectable: &[],
     admit_body: rules::admit_body,
     admit_change: rules::change_rules,
+    schema: |g| g.subschema_for::<Application>(),
 };
