@@ -218,14 +218,13 @@ impl Lanes {
         if table.events.is_none() {
             return;
         }
-        if !table.lanes.contains_key(&executor) {
+        let Some(lane) = table.lanes.get_mut(&executor) else {
             if door.is_some() {
                 let lane = self.lane(executor.clone(), node, door);
                 table.lanes.insert(executor, lane);
             }
             return;
-        }
-        let Some(lane) = table.lanes.get_mut(&executor) else { return };
+        };
         lane.node = node;
         let changed = lane.door.send_if_modified(|present| {
             let changed = *present != door;
