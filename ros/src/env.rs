@@ -47,7 +47,7 @@ pub fn address_towards(master: SocketAddr) -> IpAddr {
         socket.connect(master)?;
         socket.local_addr()
     });
-    way.map_or_else(|_| IpAddr::from([127, 0, 0, 1]), |address| address.ip())
+    way.map_or_else(|_| [127, 0, 0, 1].into(), |address| address.ip())
 }
 
 /// Where to listen so that others reach `host`: at its address when that is one of this machine's, else at all.

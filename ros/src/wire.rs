@@ -348,7 +348,7 @@ mod tests {
         let image = sensor_msgs::Image { data: vec![7; 100].into(), ..Default::default() };
         let body = Bytes::from(image.encode());
         let range = body.as_ptr_range();
-        let read = sensor_msgs::Image::decode(body.clone()).unwrap();
+        let read = sensor_msgs::Image::decode(body).unwrap();
         assert!(range.contains(&read.data.as_ptr()));
     }
 }

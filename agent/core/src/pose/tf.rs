@@ -167,7 +167,7 @@ fn interpolate(samples: &VecDeque<(Nanos, Transform)>, time: Nanos) -> Option<(N
     let after = samples.partition_point(|(stamp, _)| *stamp < time);
     let (Some(before), Some((later, end))) = (after.checked_sub(1), samples.get(after)) else {
         // Before the first, or after the last.
-        return samples.get(after).or(samples.back()).copied();
+        return samples.get(after).or_else(|| samples.back()).copied();
     };
     let (earlier, begin) = &samples[before];
     #[expect(clippy::cast_precision_loss, reason = "spans of seconds, in nanoseconds")]
