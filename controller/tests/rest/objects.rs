@@ -148,6 +148,9 @@ async fn patches_are_of_two_kinds() {
     assert_eq!(refusal(&send(&admin, "PATCH", &path, stale).await), (409, "Conflict"));
     let media = "application/strategic-merge-patch+json";
     let strategic = send_as(&admin, "PATCH", &path, media, "{}".into()).await;
+    assert_eq!(strategic.0, 200, "kubectl patches core kinds so: {}", strategic.1);
+    send(&admin, "POST", TASKS, task("p")).await;
+    let strategic = send_as(&admin, "PATCH", &format!("{TASKS}/p"), media, "{}".into()).await;
     assert_eq!(refusal(&strategic), (415, "UnsupportedMediaType"));
     let missing = send(&admin, "PATCH", &format!("{EVENTS}/none"), json!({})).await;
     assert_eq!(refusal(&missing), (404, "NotFound"));
