@@ -301,7 +301,8 @@ fn attempts_on_one_node() {
             None
         }
     };
-    let rows: &[Row<(RestartPolicy, Option<u32>), Option<u32>>] = &[
+    type Attempts = Row<(RestartPolicy, Option<u32>), Option<u32>>;
+    let rows: &[Attempts] = &[
         ((Never, None), Some(1), Same),
         ((Never, Some(3)), Some(1), Same),
         ((OnFailure, None), None, Same),
@@ -310,7 +311,7 @@ fn attempts_on_one_node() {
     ];
     hold(rows, failing(false));
     let other = "another node may have the image, and somebody asked for it to be tried";
-    let rows: &[Row<(RestartPolicy, Option<u32>), Option<u32>>] = &[
+    let rows: &[Attempts] = &[
         ((Never, None), None, Same),
         ((Never, Some(1)), None, Differs(Some(1), other)),
         ((OnFailure, None), None, Same),

@@ -34,7 +34,7 @@ fn object(i: usize) -> ConfigMap {
 /// Reads until everything has come that should; the object's counter must go up by one each time.
 async fn follow(api: Api<ConfigMap>, labels: Option<String>, since: String) -> usize {
     let params = WatchParams::default();
-    let params = labels.as_deref().map_or(params.clone(), |labels| params.labels(labels));
+    let params = labels.iter().fold(params.clone(), |params, labels| params.labels(labels));
     let mut events = api.watch(&params, &since).await.expect("a watch").boxed();
     let wanted = ROUNDS * if labels.is_some() { OBJECTS / SHELVES } else { OBJECTS };
     let mut last: BTreeMap<String, usize> = BTreeMap::new();

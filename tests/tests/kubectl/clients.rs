@@ -157,7 +157,7 @@ async fn every_watcher_sees_each_of_its_events_once_and_in_order() {
         let mine = (w < WATCHERS).then(|| format!("group=m{}", w % GROUPS));
         watchers.spawn(async move {
             let params = WatchParams::default();
-            let params = mine.as_deref().map_or(params.clone(), |labels| params.labels(labels));
+            let params = mine.iter().fold(params.clone(), |params, labels| params.labels(labels));
             let mut events = api.watch(&params, &since).await.expect("a watch").boxed();
             let wanted = if mine.is_some() { ROUNDS } else { ROUNDS * GROUPS };
             let mut last: BTreeMap<String, usize> = BTreeMap::new();

@@ -276,7 +276,7 @@ fn choose(cluster: &Cluster, demand: &Demand) -> Option<Slot> {
             best_scored(cluster, demand, &mut second_best)
         }
     };
-    robot.or(second_best.map(|(_, slot)| slot))
+    robot.or_else(|| second_best.map(|(_, slot)| slot))
 }
 
 /// The node that the task asks to be tried first, when it takes the task.
