@@ -130,6 +130,7 @@ fn the_robot_stands_without_its_agent_and_goes_on_with_the_next() {
     });
     driver.wait("go 2");
     assert_eq!(agent.gate_pid(), gate, "it outlives the agent");
+    controller.wait_hello(2);
     // One that goes in order is waited for: nothing stops.
     let before = driver.heard();
     agent.terminate();

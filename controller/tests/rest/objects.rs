@@ -202,6 +202,8 @@ async fn discovery_tells_what_there_is() {
     assert_eq!(
         named,
         [
+            "applications",
+            "applications/status",
             "frameworks",
             "frameworks/status",
             "leases",
