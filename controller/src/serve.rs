@@ -22,8 +22,9 @@ use crate::auth::Identity;
 
 /// A client that has not finished its handshake by then is gone or hostile.
 const HANDSHAKE: Duration = Duration::from_secs(10);
-/// Time for the head of a request; slow ones only hold a connection.
-const HEAD: Duration = Duration::from_secs(30);
+/// For a request's head; an idle connection waits for the next one as well. As long as Kubernetes' API server keeps idle
+/// connections: clients keep them so long, and lose the request that they send just as the server closes.
+const HEAD: Duration = Duration::from_secs(90);
 /// An HTTP/2 peer that vanished (robot out of the building) is noticed by a ping after this silence.
 const PING: Duration = Duration::from_secs(15);
 /// When accept fails, file descriptors are used up; closing connections frees them, spinning does not.
