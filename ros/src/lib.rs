@@ -4,7 +4,7 @@
 //! |---|---|
 //! | [`message`], [`wire`], [`time`] | messages made from `msgs/`, with their checksums and serialisation |
 //! | [`convert`] | the same messages as protobuf, both ways |
-//! | [`name`], [`env`] | graph names, namespaces, remapping; what `ROS_…` variables say |
+//! | [`name`], [`mod@env`] | graph names, namespaces, remapping; what `ROS_…` variables say |
 //! | [`xmlrpc`] | values, calls, answers; the client's and the server's side over HTTP |
 //! | [`master`] | the master's API |
 //! | [`tcpros`] | connection headers, frames |

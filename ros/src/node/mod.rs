@@ -2,11 +2,11 @@
 //!
 //! | module | is |
 //! |---|---|
-//! | [`registrar`] | one task: keeps the master's knowledge of this node as it should be |
-//! | [`slave`] | the API that the master and other nodes call |
-//! | [`subscription`] | a task a topic, and one below it for each publisher: [`link`] |
-//! | [`publication`] | a task for all who connect, and one for each subscriber |
-//! | [`bus`] | every connection, for `rosnode info` |
+//! | `registrar` | one task: keeps the master's knowledge of this node as it should be |
+//! | `slave` | the API that the master and other nodes call |
+//! | `subscription` | a task a topic, and one below it for each publisher: `link` |
+//! | `publication` | a task for all who connect, and one for each subscriber |
+//! | `bus` | every connection, for `rosnode info` |
 
 mod bus;
 mod link;

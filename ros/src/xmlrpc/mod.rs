@@ -1,4 +1,4 @@
-//! XML-RPC as ROS speaks it. [`read`] and [`write`] are pure; [`http`] carries them.
+//! XML-RPC as ROS speaks it. `read` and `write` are pure; `http` carries them.
 //!
 //! Whoever reaches the port may say anything: sizes, depth and times are bounded, and a document type (with the entities
 //! it could define) is refused.

@@ -12,9 +12,10 @@ use std::sync::mpsc::{Receiver, channel};
 use std::time::{Duration, Instant};
 
 use kube::api::{Patch, PatchParams};
+use muster_api::kind::node::Node;
 use muster_api::phase::TaskPhase;
 use muster_tests::puppet::python;
-use muster_tests::{AgentOptions, Cluster, kernel};
+use muster_tests::{AgentOptions, Cluster, kernel, wait};
 use serde_json::json;
 
 use crate::stats::{Samples, figure, millis};
@@ -138,7 +139,7 @@ impl Robot {
             .env("MUSTER_GATE_TOKEN", &self.token)
             .env("MUSTER_LEASE", &self.lease)
             .stdout(Stdio::null())
-            .stderr(Stdio::inherit())
+            .stderr(Stdio::null())
             .spawn()
             .expect("python starts")
     }
@@ -214,20 +215,21 @@ impl Robot {
         samples
     }
 
-    /// A person releases every stop that the robot has told of.
+    /// A person releases the stop, once the robot has told of it.
     async fn release(&self) {
         let nodes = self.cluster.nodes().await;
-        loop {
-            let node = nodes.get("robot").await.expect("it is there");
-            let estop = node.status.and_then(|status| status.estop).unwrap_or_default();
-            if estop.tier.is_none() && node.spec.estop.is_none() {
-                return;
-            }
-            let spec = json!({"estop": null, "estopRelease": estop.number});
-            let patch = Patch::Merge(json!({ "spec": spec }));
-            nodes.patch("robot", &PatchParams::default(), &patch).await.expect("it is there");
-            tokio::time::sleep(Duration::from_millis(20)).await;
-        }
+        let told = async |stopped: bool| {
+            let is = |node: Option<&Node>| {
+                let estop = node.and_then(|n| n.status.as_ref()).and_then(|s| s.estop.as_ref());
+                estop.is_some_and(|estop| estop.tier.is_none() != stopped)
+            };
+            wait::object(nodes.clone(), "robot", "told of the stop", is).await
+        };
+        let estop = told(true).await.and_then(|node| node.status).and_then(|status| status.estop);
+        let number = estop.map(|estop| estop.number);
+        let patch = Patch::Merge(json!({"spec": {"estop": null, "estopRelease": number}}));
+        nodes.patch("robot", &PatchParams::default(), &patch).await.expect("it is there");
+        told(false).await;
     }
 }
 
