@@ -26,6 +26,9 @@ const AGAIN: Duration = Duration::from_millis(100);
 /// Between a cut and the end of the driver: it reads its stop, if it reads at all.
 const LAST_WORD: Duration = Duration::from_millis(20);
 
+/// A driver that has not read for this long is begun anew.
+const READS_WITHIN: Duration = Duration::from_millis(200);
+
 /// What may lie in a driver's pipe, bytes: the least that the kernel has. What lies there comes before a stop.
 const PIPE: usize = 4096;
 
@@ -227,7 +230,15 @@ impl End {
     /// Ends it, and waits for that: the next one is the only one.
     async fn now(self) {
         match self {
-            End::Program(mut child) => drop(child.kill().await),
+            End::Program(mut child) => {
+                let group = child.id().and_then(|id| i32::try_from(id).ok());
+                if let Some(group) = group.and_then(rustix::process::Pid::from_raw) {
+                    // Gone already: that is what was wanted.
+                    let _ =
+                        rustix::process::kill_process_group(group, rustix::process::Signal::KILL);
+                }
+                drop(child.kill().await);
+            }
             End::Socket(from) => drop(from),
         }
     }
@@ -237,7 +248,10 @@ type To = Box<dyn AsyncWrite + Send + Unpin>;
 
 async fn reach(settings: &settings::Driver) -> io::Result<(To, End)> {
     if let Some(path) = &settings.unix {
-        let (from, to) = UnixStream::connect(path).await?.into_split();
+        let stream = UnixStream::connect(path).await?;
+        // The kernel takes no less than its least.
+        rustix::net::sockopt::set_socket_send_buffer_size(&stream, PIPE)?;
+        let (from, to) = stream.into_split();
         return Ok((Box::new(to), End::Socket(from)));
     }
     let missing = || io::Error::new(io::ErrorKind::InvalidInput, "no program");
@@ -245,6 +259,8 @@ async fn reach(settings: &settings::Driver) -> io::Result<(To, End)> {
     let mut command = Command::new(program);
     // Its standard error is the gate's log.
     command.args(args).stdin(Stdio::piped()).stdout(Stdio::null()).kill_on_drop(true);
+    // What it starts ends with it.
+    command.process_group(0);
     // SAFETY: prctl is async-signal-safe, and nothing else happens between fork and exec.
     unsafe {
         // Two of one driver must never be: it ends with the gate, however that ends.
@@ -263,8 +279,13 @@ async fn reach(settings: &settings::Driver) -> io::Result<(To, End)> {
 async fn feed(line: &Line, to: &mut To) -> io::Error {
     loop {
         let frame = line.next().await;
-        if let Err(error) = to.write_all(&frame).await {
-            return error;
+        match tokio::time::timeout(READS_WITHIN, to.write_all(&frame)).await {
+            Ok(Ok(())) => {}
+            Ok(Err(error)) => return error,
+            // A stop may wait behind it, and would wait for ever.
+            Err(_) => {
+                return io::Error::new(io::ErrorKind::TimedOut, "it does not read its commands");
+            }
         }
     }
 }

@@ -14,9 +14,10 @@ use muster_api::id::{Epoch, TaskUid};
 use muster_api::kind::lease::DEFAULT_GROUP;
 use muster_api::wire::gate::v1 as proto;
 use proto::call::Call as Said;
-use tokio::signal::unix::{SignalKind, signal};
+use tokio::signal::unix::{Signal, SignalKind, signal};
 use tokio::sync::{mpsc, oneshot};
 use tokio::task::JoinSet;
+use tokio::time::Instant;
 
 use super::door::{self, Back};
 use super::driver::Driver;
@@ -33,6 +34,10 @@ const KEPT: &str = "kept.json";
 
 /// Longest command, bytes.
 const LONGEST: usize = 60 << 10;
+
+/// An agent that says nothing for this long (it repeats itself every second) is stuck, and nobody can take the robot back
+/// through it.
+const STUCK: Duration = Duration::from_secs(3);
 
 /// At the end, until the drivers have read their stop.
 const LAST_STOP: Duration = Duration::from_millis(100);
@@ -70,6 +75,8 @@ struct Hall {
     /// The newest connection; its way back is gone when it does not read.
     agent: Option<(u64, Option<Back<proto::Status>>)>,
     wanted: u64,
+    /// When the agent last said something.
+    heard: Instant,
     silent: u64,
     gives_back: Option<Grant>,
     wake: Option<Boot>,
@@ -105,28 +112,48 @@ pub(super) async fn serve(dir: PathBuf, settings: Settings) -> Result<(), GateEr
         conns: BTreeMap::new(),
         agent: None,
         wanted: 0,
+        heard: Instant::now(),
         silent: 0,
         gives_back: None,
         wake: None,
     };
     tracing::info!(newest = %hall.core.newest(), estop = %hall.core.estop().tier(), "the gate starts");
-    hall.carry_out(response, None)?;
-    loop {
-        // Cancel-safe: a signal, a receiver and a sleep.
-        tokio::select! {
-            _ = end.recv() => break,
-            Some(input) = received.recv() => hall.take(input)?,
-            () = crate::driver::sleep_until(hall.wake) => hall.event(&Event::Tick)?,
-        }
-    }
+    let ended = hall.run(response, &mut received, &mut end).await;
     // Nobody stands before the drivers any more.
     hall.drivers.iter().for_each(Driver::stop);
     tokio::time::sleep(LAST_STOP).await;
-    Ok(())
+    ended
 }
 
 impl Hall {
-    fn take(&mut self, input: Input) -> Result<(), GateError> {
+    /// Until it is told to end, or cannot go on.
+    async fn run(
+        &mut self,
+        first: Response,
+        received: &mut mpsc::Receiver<Input>,
+        end: &mut Signal,
+    ) -> Result<(), GateError> {
+        self.carry_out(first, None).await?;
+        let mut looks = tokio::time::interval(STUCK / 4);
+        loop {
+            // Cancel-safe: a signal, a receiver, a sleep and a tick.
+            tokio::select! {
+                _ = end.recv() => return Ok(()),
+                Some(input) = received.recv() => self.take(input).await?,
+                () = crate::driver::sleep_until(self.wake) => self.event(&Event::Tick).await?,
+                _ = looks.tick() => {
+                    if self.agent.is_some() && self.heard.elapsed() > STUCK {
+                        tracing::warn!("the agent says nothing");
+                        // Its connection ends with its way back; it comes again when it can.
+                        self.agent = None;
+                        self.event(&Event::AgentGone).await?;
+                    }
+                }
+            }
+        }
+    }
+
+    async fn take(&mut self, input: Input) -> Result<(), GateError> {
         match input {
             Input::Opened { conn, token, back, admit } => {
                 let Some(task) = self.seats.get(&token).cloned() else { return Ok(()) };
@@ -136,28 +163,30 @@ impl Hall {
                 let _ = back.try_send(proto::Event { event: Some(event) });
                 self.conns.insert(conn, (task.clone(), back));
                 let _ = admit.send(());
-                self.event(&Event::Opened(conn, task))
+                self.event(&Event::Opened(conn, task)).await
             }
-            Input::Call(conn, call) => self.call(conn, call),
+            Input::Call(conn, call) => self.call(conn, call).await,
             Input::Closed(conn) => {
                 self.conns.remove(&conn);
-                self.event(&Event::Closed(conn))
+                self.event(&Event::Closed(conn)).await
             }
             Input::AgentCame(life, back) => {
+                // What an earlier one wanted is not what this one waits for.
+                (self.wanted, self.heard) = (0, Instant::now());
                 self.agent = Some((life, Some(back)));
                 Ok(())
             }
-            Input::Wanted(life, wanted) => self.wanted(life, &wanted),
+            Input::Wanted(life, wanted) => self.wanted(life, &wanted).await,
             Input::AgentGone(life) => {
                 if self.agent.take_if(|(newest, _)| *newest == life).is_none() {
                     return Ok(());
                 }
                 tracing::info!("the agent is gone");
-                self.event(&Event::AgentGone)
+                self.event(&Event::AgentGone).await
             }
             Input::DriverBack(at) => {
                 self.missing[at] = None;
-                self.event(&Event::DriverBack)?;
+                self.event(&Event::DriverBack).await?;
                 self.tell_agent();
                 Ok(())
             }
@@ -169,35 +198,35 @@ impl Hall {
                 }
                 Ok(())
             }
-            Input::Hook(name, tier) => self.event(&Event::EStop(Source::Local(name), tier)),
+            Input::Hook(name, tier) => self.event(&Event::EStop(Source::Local(name), tier)).await,
         }
     }
 
-    fn call(&mut self, conn: Conn, call: Said) -> Result<(), GateError> {
+    async fn call(&mut self, conn: Conn, call: Said) -> Result<(), GateError> {
         // It was put out, and what it says was under way.
         if !self.conns.contains_key(&conn) {
             return Ok(());
         }
         match call {
-            Said::Register(_) => self.put_out(conn),
-            Said::Retain(_) => self.event(&Event::Retain(conn)),
+            Said::Register(_) => self.put_out(conn).await,
+            Said::Retain(_) => self.event(&Event::Retain(conn)).await,
             Said::Command(command) => {
-                let verdict = self.command(conn, &command)?;
-                self.answer(conn, command.id, verdict)
+                let verdict = self.command(conn, &command).await?;
+                self.answer(conn, command.id, verdict).await
             }
             Said::Delegate(delegate) => {
                 let Some(token) = token(delegate.lease.as_ref()) else {
-                    return self.answer(conn, delegate.id, proto::Verdict::NotHolder);
+                    return self.answer(conn, delegate.id, proto::Verdict::NotHolder).await;
                 };
                 let event = Event::Delegate(conn, token, TaskUid::new(delegate.task));
                 let response = self.core.handle(&event, clock::boot());
-                let verdict = self.carry_out(response, None)?;
-                self.answer(conn, delegate.id, verdict)
+                let verdict = self.carry_out(response, None).await?;
+                self.answer(conn, delegate.id, verdict).await
             }
         }
     }
 
-    fn command(
+    async fn command(
         &mut self,
         conn: Conn,
         command: &proto::Command,
@@ -210,16 +239,16 @@ impl Hall {
         };
         let driver = self.drivers.iter().position(drives);
         let response = self.core.handle(&Event::Command(conn, token), clock::boot());
-        self.carry_out(response, driver.map(|at| (at, &command.data)))
+        self.carry_out(response, driver.map(|at| (at, &command.data))).await
     }
 
-    fn event(&mut self, event: &Event) -> Result<(), GateError> {
+    async fn event(&mut self, event: &Event) -> Result<(), GateError> {
         let response = self.core.handle(event, clock::boot());
-        self.carry_out(response, None).map(drop)
+        self.carry_out(response, None).await.map(drop)
     }
 
     /// Carries out what the core says, in order; `command` is what [`Effect::Forward`] forwards. Returns what is to be answered.
-    fn carry_out(
+    async fn carry_out(
         &mut self,
         response: Response,
         command: Option<(usize, &Bytes)>,
@@ -228,8 +257,10 @@ impl Hall {
         let mut tell = false;
         for effect in response.effects {
             match effect {
-                // A gate that cannot remember does not go on: another one begins with a stop.
+                // A gate that cannot remember does not go on: it ends with a stop, and another one begins with one.
                 Effect::Keep(kept) => {
+                    // What was told to the drivers goes out before the disk is waited for.
+                    tokio::task::yield_now().await;
                     durable::write_json(&self.dir.join(KEPT), &kept, Keep::PowerCut)?;
                 }
                 Effect::Stop(why) => self.stop(why),
@@ -264,10 +295,11 @@ impl Hall {
     }
 
     /// Takes the agent's word: seats first, so that whoever lost his cannot go on in the grant's place.
-    fn wanted(&mut self, life: u64, wanted: &proto::Wanted) -> Result<(), GateError> {
+    async fn wanted(&mut self, life: u64, wanted: &proto::Wanted) -> Result<(), GateError> {
         if self.agent.as_ref().is_none_or(|(newest, _)| *newest != life) {
             return Ok(());
         }
+        self.heard = Instant::now();
         let seats = wanted.seats.iter();
         self.seats = seats.map(|s| (s.token.clone(), TaskUid::new(s.task.clone()))).collect();
         let seated = |task: &TaskUid| wanted.seats.iter().any(|seat| seat.task == task.as_str());
@@ -277,36 +309,45 @@ impl Hall {
             .filter(|(_, (task, _))| !seated(task))
             .map(|(conn, _)| *conn)
             .collect();
-        gone.into_iter().try_for_each(|conn| self.put_out(conn))?;
+        for conn in gone {
+            self.put_out(conn).await?;
+        }
         let grant = wanted.grant.as_ref();
         let grant =
             grant.map(|g| Grant { epoch: Epoch(g.epoch), holder: TaskUid::new(g.task.clone()) });
         if self.gives_back.is_some() && self.gives_back != grant {
             self.gives_back = None;
         }
-        self.event(&Event::Granted(grant))?;
-        let tier = match wanted.estop {
-            0 => Tier::None,
-            1 => Tier::Settle,
-            _ => Tier::Cut,
-        };
-        self.event(&Event::EStop(Source::Controller, tier))?;
-        self.event(&Event::Release(wanted.release))?;
+        self.event(&Event::Granted(grant)).await?;
+        if let Some(estop) = wanted.estop {
+            let tier = match estop {
+                0 => Tier::None,
+                1 => Tier::Settle,
+                _ => Tier::Cut,
+            };
+            self.event(&Event::EStop(Source::Controller, tier)).await?;
+        }
+        self.event(&Event::Release(wanted.release)).await?;
         if wanted.leaves_for_ms > 0 {
-            self.event(&Event::AgentLeaves { back_within_ms: wanted.leaves_for_ms.into() })?;
+            self.event(&Event::AgentLeaves { back_within_ms: wanted.leaves_for_ms.into() }).await?;
         }
         self.wanted = wanted.id;
         self.tell_agent();
         Ok(())
     }
 
-    fn put_out(&mut self, conn: Conn) -> Result<(), GateError> {
+    async fn put_out(&mut self, conn: Conn) -> Result<(), GateError> {
         // Its way back goes, and with it the connection.
         self.conns.remove(&conn);
-        self.event(&Event::Closed(conn))
+        self.event(&Event::Closed(conn)).await
     }
 
-    fn answer(&mut self, conn: Conn, id: u64, verdict: proto::Verdict) -> Result<(), GateError> {
+    async fn answer(
+        &mut self,
+        conn: Conn,
+        id: u64,
+        verdict: proto::Verdict,
+    ) -> Result<(), GateError> {
         let answer = proto::Answer {
             id,
             verdict: verdict.into(),
@@ -315,7 +356,7 @@ impl Hall {
         };
         let event = proto::Event { event: Some(proto::event::Event::Answer(answer)) };
         let full = self.conns.get(&conn).is_some_and(|(_, back)| back.try_send(event).is_err());
-        if full { self.put_out(conn) } else { Ok(()) }
+        if full { self.put_out(conn).await } else { Ok(()) }
     }
 
     /// How things stand. An agent that does not read is put out: it comes again, and hears everything.

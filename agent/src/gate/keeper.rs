@@ -31,6 +31,9 @@ use crate::runtime::process::Reexec;
 /// Between two looks for a gate that is not there. The robot stands meanwhile, so it is short.
 const AGAIN: Duration = Duration::from_millis(20);
 
+/// The agent says what it wants at least so often; see `hall`'s `STUCK`.
+const SAY_EVERY: Duration = Duration::from_secs(1);
+
 /// Between two starts of a gate that ends at once.
 const START_AGAIN: Duration = Duration::from_millis(200);
 
@@ -57,7 +60,8 @@ struct Seat {
 struct Wanted {
     id: u64,
     seats: BTreeMap<TaskUid, Seat>,
-    estop: u32,
+    /// None: not heard yet.
+    estop: Option<u32>,
     release: u64,
     leaves: bool,
 }
@@ -188,7 +192,7 @@ impl Keeper {
     pub(crate) fn demand(&self, estop: u32, release: u64) {
         self.change(|wanted| {
             let before = (wanted.estop, wanted.release);
-            (wanted.estop, wanted.release) = (estop, release.max(wanted.release));
+            (wanted.estop, wanted.release) = (Some(estop), release.max(wanted.release));
             before != (wanted.estop, wanted.release)
         });
     }
@@ -282,7 +286,9 @@ impl Keeper {
                 newest.borrow_and_update();
                 let message = self.wanted.lock().unwrap_or_else(PoisonError::into_inner).message();
                 frame::write(&mut to, &message).await?;
-                if newest.changed().await.is_err() {
+                // Said again without a change, so that the gate knows that this agent is not stuck.
+                let change = tokio::time::timeout(SAY_EVERY, newest.changed()).await;
+                if matches!(change, Ok(Err(_))) {
                     return Ok(());
                 }
             }

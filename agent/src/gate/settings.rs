@@ -6,7 +6,7 @@
 //!     - actuators: ["base:Drive"]
 //!       exec: [/usr/lib/robot/base-driver]     # or unix: /run/robot/base.sock
 //!       stop: '{"linear": 0, "angular": 0}'
-//!   ladder: [{after: 200ms, action: Stop}, {after: 10s, action: Release}]
+//!   ladder: [{after: 100ms, action: Log}, {after: 200ms, action: Stop}]
 //!   agentGrace: 0s
 //!   estop:
 //!     - {name: button, gpio: /sys/class/gpio/gpio17/value, activeLow: true}
@@ -123,6 +123,14 @@ pub(crate) enum SettingsError {
     NotDeclared { at: usize, actuator: FunctionName },
     #[error("drivers[{at}].{field}: a command with a newline needs `framing: Length`")]
     Newline { at: usize, field: &'static str },
+    #[error("ladder: there is no Stop in it; a robot whose driver is silent would go on for ever")]
+    NoStop,
+    #[error("ladder[{0}]: Hold comes before Stop")]
+    HoldAfterStop(usize),
+    #[error(
+        "ladder[{0}]: Release is not served: nobody ends the task of a silent holder; leave it out"
+    )]
+    Release(usize),
     #[error("estop[{0}]: give exactly one of file and gpio")]
     HookWay(usize),
     #[error("estop[{at}].name: {name:?} is taken, or empty; each needs a name of its own")]
@@ -158,6 +166,7 @@ impl Settings {
             }
             driver.check_lines(at)?;
         }
+        self.check_ladder()?;
         let mut names = BTreeSet::new();
         for (at, hook) in self.estop.iter().enumerate() {
             if hook.file.is_some() == hook.gpio.is_some() {
@@ -168,6 +177,21 @@ impl Settings {
             }
             if hook.tier == Tier::None {
                 return Err(SettingsError::HookTier(at));
+            }
+        }
+        Ok(())
+    }
+
+    fn check_ladder(&self) -> Result<(), SettingsError> {
+        let Some(rungs) = &self.ladder else { return Ok(()) };
+        let stop =
+            rungs.iter().filter(|rung| rung.action == Action::Stop).map(|rung| rung.after).min();
+        let stop = stop.ok_or(SettingsError::NoStop)?;
+        for (at, rung) in rungs.iter().enumerate() {
+            match rung.action {
+                Action::Release => return Err(SettingsError::Release(at)),
+                Action::Hold if rung.after >= stop => return Err(SettingsError::HoldAfterStop(at)),
+                Action::Hold | Action::Log | Action::Stop => {}
             }
         }
         Ok(())
@@ -251,6 +275,12 @@ mod tests {
             (
                 "drivers: [{actuators: ['base:Drive'], exec: [a], stop: \"a\\nb\"}]",
                 "drivers[0].stop",
+            ),
+            ("ladder: []", "no Stop"),
+            ("ladder: [{after: 1s, action: Stop}, {after: 2s, action: Hold}]", "ladder[1]: Hold"),
+            (
+                "ladder: [{after: 1s, action: Stop}, {after: 2s, action: Release}]",
+                "ladder[1]: Release",
             ),
             ("estop: [{name: a}]", "estop[0]: give exactly one"),
             ("estop: [{name: a, file: /a}, {name: a, gpio: /b}]", "estop[1].name: \"a\" is taken"),

@@ -6,8 +6,9 @@
 use std::time::Duration;
 
 use futures::future::join_all;
+use muster_api::condition::{ACTUATORS_FENCED, ConditionStatus};
 use muster_api::kind::node::estop::{EStopStatus, EStopTier};
-use muster_api::kind::node::{Node, NodeKind};
+use muster_api::kind::node::{Node, NodeKind, NodeStatus};
 use serde_json::{Value, json};
 use tokio::time::Instant;
 
@@ -138,14 +139,21 @@ fn verdict(node: &Node, tier: EStopTier) -> Result<Option<String>, CliError> {
     Ok(match tier {
         EStopTier::None if estop.tier.is_none() => Some("released".to_owned()),
         EStopTier::None => None,
-        tier if estop.tier >= tier => Some(format!("stopped ({})", estop.tier)),
+        // A driver that is not there has not heard it.
+        tier if estop.tier >= tier && fenced(status) => Some(format!("stopped ({})", estop.tier)),
         _ => None,
     })
 }
 
+/// Every driver is there, behind the gate.
+fn fenced(status: Option<&NodeStatus>) -> bool {
+    let condition = status.and_then(|status| status.condition(ACTUATORS_FENCED));
+    condition.is_some_and(|condition| condition.status == ConditionStatus::True)
+}
+
 fn in_vain(name: &str, node: &Node, tier: EStopTier) -> CliError {
     let status = node.status.as_ref();
-    let ready = status.is_some_and(muster_api::kind::node::NodeStatus::is_ready);
+    let ready = status.is_some_and(NodeStatus::is_ready);
     let estop = status.and_then(|status| status.estop.as_ref());
     let (why, hint) = match (ready, estop) {
         (false, _) => ("its agent is not heard", "it is told as soon as it is; stop it by hand"),
@@ -154,6 +162,9 @@ fn in_vain(name: &str, node: &Node, tier: EStopTier) -> CliError {
             "stop it by hand; its drivers belong under `gate` in agent.yaml",
         ),
         (true, Some(_)) if tier.is_none() => ("it is still stopped", "look at what still stops it"),
+        (true, Some(_)) if !fenced(status) => {
+            ("a driver is not there to hear it (see ActuatorsFenced)", "stop it by hand")
+        }
         (true, Some(_)) => ("its gate has not said that it stands", "stop it by hand"),
     };
     let still: Vec<String> = estop.map(said).unwrap_or_default();
@@ -177,7 +188,7 @@ mod tests {
     use crate::fake::{Fake, node};
 
     fn robot(name: &str, estop: &serde_json::Value) -> serde_json::Value {
-        let ready = json!([{"type": "Ready", "status": "True"}]);
+        let ready = json!([{"type": "Ready", "status": "True"}, {"type": "ActuatorsFenced", "status": "True"}]);
         node(name, json!({"conditions": ready, "estop": estop}))
     }
 

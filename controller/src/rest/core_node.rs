@@ -24,18 +24,49 @@ pub(super) async fn write(call: Call, verb: Verb, target: Object) -> Answer {
         let make = |present: &Value| {
             let node = read(present)?;
             let view = project::node::node(present, &node);
-            Ok(project::node::changed(present, &node, &patch::apply(&patch, &view)?))
+            let changed = patch::apply(&patch, &view)?;
+            check(&changed)?;
+            Ok(project::node::changed(present, &node, &changed))
         };
         update::change(&context, &ours, &options, make).await?
     } else {
         let (parts, body) = request.into_parts();
         let view = body::json(&parts.headers, body).await?;
+        check(&view)?;
         let make = |present: &Value| Ok(project::node::changed(present, &read(present)?, &view));
         update::change(&context, &ours, &options, make).await?
     };
     let object = scale::read(changed.into_body()).await?;
     let view = project::node::node(&object, &read(&object)?);
     Ok(super::json(StatusCode::OK, &view))
+}
+
+/// A core Node, as far as something of it counts here: what is left out would be taken away.
+fn check(view: &Value) -> Result<(), Failure> {
+    let wrong =
+        |what: &str| Err(Failure::bad_request(format!("{what}; send the Node as it was read")));
+    if view["apiVersion"] != "v1" || view["kind"] != "Node" {
+        return wrong("apiVersion and kind are not those of a core Node");
+    }
+    if !view["metadata"]["name"].is_string() {
+        return wrong("metadata.name is missing");
+    }
+    for field in ["labels", "annotations"] {
+        let map = &view["metadata"][field];
+        let texts = map.as_object().is_some_and(|map| map.values().all(Value::is_string));
+        if !map.is_null() && !texts {
+            return wrong(&format!("metadata.{field} is no map of texts"));
+        }
+    }
+    let (closed, taints) = (&view["spec"]["unschedulable"], &view["spec"]["taints"]);
+    if !closed.is_null() && !closed.is_boolean() {
+        return wrong("spec.unschedulable is neither true nor false");
+    }
+    let listed = taints.as_array().is_some_and(|list| list.iter().all(Value::is_object));
+    if !taints.is_null() && !listed {
+        return wrong("spec.taints is no list of taints");
+    }
+    Ok(())
 }
 
 fn read(object: &Value) -> Result<Node, Failure> {

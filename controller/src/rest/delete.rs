@@ -81,6 +81,20 @@ pub(crate) async fn delete_with_grace(
     }
 }
 
+/// Ends this object and no other of its name.
+pub(super) async fn end_this(
+    context: &Context,
+    stored: &Stored,
+    grace_period_seconds: Option<i64>,
+) -> Result<(), Failure> {
+    let entry = super::registry::of(stored.key.resource)
+        .ok_or_else(|| Failure::internal(format!("{} is not served", stored.key.resource)))?;
+    let uid = Some(stored.uid.to_string());
+    let preconditions = Preconditions { uid, ..Preconditions::default() };
+    let options = Options { grace_period_seconds, preconditions, ..Options::default() };
+    end(context, entry, &stored.key, &options).await.map(drop)
+}
+
 /// The deletion of an object as a part of a transaction: at once where nobody has to confirm anything, else the wish.
 pub(crate) fn operation(now: Timestamp, present: &Stored) -> Op {
     let (object, key) = (present.value(), present.key.clone());

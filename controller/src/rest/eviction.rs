@@ -39,7 +39,11 @@ pub(super) async fn evict(call: Call, target: Object) -> Answer {
     let dry = dry || options["dryRun"].as_array().is_some_and(|list| !list.is_empty());
     if !dry {
         let grace = options["gracePeriodSeconds"].as_i64();
-        delete::delete_with_grace(&context, &key, grace).await?;
+        if grace.is_some_and(|grace| grace < 0) {
+            return Err(Failure::bad_request("gracePeriodSeconds must not be negative"));
+        }
+        // Of this one: another may have taken its name meanwhile.
+        delete::end_this(&context, &stored, grace).await?;
     }
     let status: Value = json!({"kind": "Status", "apiVersion": "v1", "metadata": {}, "status": "Success", "code": 201});
     Ok(super::json(StatusCode::CREATED, &status))

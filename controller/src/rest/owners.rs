@@ -205,15 +205,20 @@ fn first(schema: &Value, live: &Value, owned: &Value) -> Owners {
 /// What kubectl says that it applied itself.
 fn last_applied(live: &Value) -> Option<Value> {
     let last = live["metadata"]["annotations"].get(LAST_APPLIED)?.as_str()?;
-    serde_json::from_str(last).ok()
+    serde_json::from_str(last).ok().filter(Value::is_object)
 }
 
 /// Whether all of this is what kubectl says that it applied itself.
 fn all_kubectls(schema: &Value, live: &Value, conflicts: &[Conflict]) -> bool {
     let Some(last) = last_applied(live) else { return false };
     let fields = apply::all_of(schema, &ownable(&last));
+    let by_itself = |manager: &Manager| {
+        manager.operation == Operation::Update && manager.name == "kubectl-client-side-apply"
+    };
     conflicts.iter().all(|conflict| {
-        fields.contains(&conflict.path) || conflict.path.to_string().contains("last-applied")
+        let said =
+            fields.contains(&conflict.path) || conflict.path.to_string().contains("last-applied");
+        said && by_itself(&conflict.manager)
     })
 }
 

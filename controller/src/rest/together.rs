@@ -66,7 +66,8 @@ fn new_tasks(
             continue;
         }
         let object = question::with_defaults(context, object);
-        let resources = create::resources_of(&object)?;
+        // What cannot be read is refused by itself, with its place.
+        let Ok(resources) = create::resources_of(&object) else { continue };
         new.entry(namespace).or_default().push(Asking { index, name, resources });
     }
     Ok(new)

@@ -66,6 +66,9 @@ pub struct EStop {
     demands: Vec<Demand>,
     /// How many stops there were.
     number: u64,
+    /// The newest release: one that is said again releases nothing.
+    #[serde(default)]
+    released: u64,
 }
 
 impl EStop {
@@ -103,17 +106,33 @@ impl EStop {
         }
         demand.now = tier;
         demand.latched = match source {
-            Source::Controller => tier,
+            // Only its end lets go: a second person who stops the robot less far does not switch its power on.
+            Source::Controller if tier == Tier::None => Tier::None,
+            Source::Controller => demand.latched.max(tier),
             Source::Local(_) => demand.latched.max(tier),
         };
         self.forget();
     }
 
-    /// A person releases the stops up to this number: their sources fall back to what they demand now, so that a button that is
-    /// still pressed keeps the robot where it is.
+    /// A person releases the stops up to this number, once: their sources fall back to what they demand now. A button that is
+    /// still pressed keeps the robot where it is, and counts as a stop that comes after: it needs a release of its own.
     pub fn release(&mut self, number: u64) {
-        let known = self.demands.iter_mut().filter(|demand| demand.number <= number);
-        known.for_each(|demand| demand.latched = demand.now);
+        if number <= self.released {
+            return;
+        }
+        self.released = number;
+        if number > self.number {
+            // Of another life of this robot's records: it has seen none of these.
+            self.number = number;
+            return;
+        }
+        for demand in self.demands.iter_mut().filter(|demand| demand.number <= number) {
+            demand.latched = demand.now;
+            if demand.now > Tier::None {
+                self.number += 1;
+                demand.number = self.number;
+            }
+        }
         self.forget();
     }
 
@@ -153,6 +172,37 @@ mod tests {
         assert_eq!(stop.tier(), Tier::Cut);
         stop.demand(&button, Tier::None);
         stop.release(stop.number());
+        assert_eq!(stop.tier(), Tier::None);
+    }
+
+    #[test]
+    fn a_release_counts_once_and_not_for_a_button_that_was_pressed_all_the_time() {
+        let button = Source::Local("button".to_owned());
+        let mut stop = EStop::default();
+        stop.demand(&button, Tier::Cut);
+        let seen = stop.number();
+        stop.release(seen);
+        stop.demand(&button, Tier::None);
+        stop.release(seen);
+        assert_eq!(stop.tier(), Tier::Cut, "the same release, said again");
+        stop.release(stop.number());
+        assert_eq!(stop.tier(), Tier::None);
+        // A record that was lost begins with smaller numbers than the release that is still written down.
+        let mut stop = EStop::default();
+        stop.release(40);
+        stop.demand(&button, Tier::Settle);
+        stop.demand(&button, Tier::None);
+        stop.release(40);
+        assert_eq!((stop.tier(), stop.number()), (Tier::Settle, 41));
+    }
+
+    #[test]
+    fn who_stops_less_far_switches_nothing_on() {
+        let mut stop = EStop::default();
+        stop.demand(&Source::Controller, Tier::Cut);
+        stop.demand(&Source::Controller, Tier::Settle);
+        assert_eq!(stop.tier(), Tier::Cut);
+        stop.demand(&Source::Controller, Tier::None);
         assert_eq!(stop.tier(), Tier::None);
     }
 

@@ -42,7 +42,8 @@ impl Ladder {
     /// Steps in the order of their times.
     #[must_use]
     pub(super) fn new(mut steps: Vec<Step>) -> Ladder {
-        steps.sort_by_key(|step| step.after_ms);
+        // A sign of life puts off a release and nothing else, so nothing stands behind it.
+        steps.sort_by_key(|step| (step.action == Action::Release, step.after_ms));
         Ladder { steps, taken: usize::MAX }
     }
 

@@ -324,12 +324,7 @@ impl Gate {
                 estop.release(*number);
                 self.set_estop(estop, &mut effects);
             }
-            Event::DriverBack => {
-                self.stop(StopReason::DriverStarts, &mut effects);
-                if self.kept.estop.tier() == Tier::Cut {
-                    effects.push(Effect::Cut);
-                }
-            }
+            Event::DriverBack => self.stop(StopReason::DriverStarts, &mut effects),
             Event::Tick => {}
         }
         Response { effects, wake: self.wake() }
@@ -371,35 +366,41 @@ impl Gate {
         self.driving = None;
         self.ladder.rest();
         effects.push(Effect::Stop(why));
+        // A stop takes the place of what waits for a driver, so a cut that is in force is said again.
+        if self.kept.estop.tier() == Tier::Cut {
+            effects.push(Effect::Cut);
+        }
     }
 
     fn granted(&mut self, grant: Option<&Grant>, effects: &mut Vec<Effect>) {
         self.grip = Grip::Held;
         let newest = self.kept.newest.epoch;
-        let is_new = match (grant, &self.grant) {
-            (Some(grant), Some(present)) if grant == present => false,
-            // An agent that was started again on an older record must not bring an older holder back; nor may two tasks
-            // have one number.
-            (Some(grant), Some(_)) => grant.epoch > newest,
-            (Some(grant), None) => {
-                let again = self.former.as_ref().is_none_or(|former| former == grant);
-                grant.epoch > newest || (grant.epoch == newest && again)
+        // An agent that was started again on an older record must not bring an older holder back; nor may two tasks have one
+        // number. Such a grant is none: whoever held the robot does not hold it any more, either.
+        let counts = |grant: &&Grant| match &self.grant {
+            _ if grant.epoch > newest => true,
+            Some(present) => *grant == present,
+            None => {
+                let again = self.former.as_ref().is_none_or(|former| former == *grant);
+                grant.epoch == newest && again
             }
-            (None, present) => present.is_some(),
         };
-        if is_new {
-            let before = std::mem::replace(&mut self.grant, grant.cloned());
-            self.delegates.clear();
-            if let Some(grant) = grant.filter(|grant| grant.epoch > newest) {
-                self.kept.newest = Token::root(grant.epoch);
-                effects.push(Effect::Keep(self.kept.clone()));
-            }
-            if before.is_some() {
-                self.former = before;
-                self.stop(StopReason::Revoked, effects);
-            }
-            effects.push(Effect::Report);
+        let grant = grant.filter(counts);
+        if grant == self.grant.as_ref() {
+            return;
         }
+        let before = std::mem::replace(&mut self.grant, grant.cloned());
+        self.delegates.clear();
+        // The robot first, the record after. The new holder hears of its right when the record is there.
+        if before.is_some() {
+            self.former = before;
+            self.stop(StopReason::Revoked, effects);
+        }
+        if let Some(grant) = grant.filter(|grant| grant.epoch > newest) {
+            self.kept.newest = Token::root(grant.epoch);
+            effects.push(Effect::Keep(self.kept.clone()));
+        }
+        effects.push(Effect::Report);
     }
 
     fn agent_gone(&mut self, now: Boot, effects: &mut Vec<Effect>) {
@@ -497,9 +498,6 @@ impl Gate {
         if tier > before {
             // The robot first, the record after: the disk may be slow.
             self.stop(StopReason::EStop(tier), effects);
-            if tier == Tier::Cut {
-                effects.push(Effect::Cut);
-            }
         }
         effects.push(Effect::Keep(self.kept.clone()));
         effects.push(Effect::Report);

@@ -61,7 +61,7 @@ fn a_grant_that_is_taken_back_counts_at_once_and_stops_the_robot() {
     let kept = Kept { newest: token("7"), estop: EStop::default() };
     assert_eq!(
         response.effects,
-        [Effect::Keep(kept), Effect::Stop(StopReason::Revoked), Effect::Report]
+        [Effect::Stop(StopReason::Revoked), Effect::Keep(kept), Effect::Report]
     );
     assert_eq!(verdict(&mut gate, A, "6"), Verdict::Revoked);
     assert_eq!(verdict(&mut gate, A, "7"), Verdict::NotHolder);
@@ -77,6 +77,9 @@ fn a_grant_that_is_taken_back_counts_at_once_and_stops_the_robot() {
     }
     let _ = gate.handle(&grant(7, "b"), Boot(5));
     assert_eq!(verdict(&mut gate, B, "7"), Verdict::Ok);
+    // While the newer holder is gone and the older one still ends, nobody holds it.
+    assert_eq!(stops(&gate.handle(&grant(6, "a"), Boot(6))), [StopReason::Revoked]);
+    assert_eq!(gate.holder(), None);
 }
 
 #[test]
