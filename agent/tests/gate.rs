@@ -232,3 +232,26 @@ fn a_gate_of_another_set_up_is_replaced() {
     until("the gate's end", || (!lives(gate)).then_some(()));
     assert_eq!(driver.heard().last().map(String::as_str), Some("stop"));
 }
+
+#[test]
+fn the_controllers_stop_stands_when_the_agent_is_started_again() {
+    let (controller, driver) = (Controller::start(), Driver::new(PATIENT));
+    let mut agent = robot(&controller, &driver);
+    let mut a = Holder::register(&agent, "a");
+    controller.order_estop(1, 0);
+    until("the stop", || (a.verdict("6", "go") == Verdict::Stopped).then_some(()));
+    controller.set_away(true);
+    agent.kill();
+    agent.spawn();
+    // This life of the agent says what it wants before it hears of the stop.
+    let hellos = controller.hellos().len();
+    controller.set_away(false);
+    until("its hello", || {
+        assert_eq!(a.verdict("6", "go wrong"), Verdict::Stopped);
+        (controller.hellos().len() > hellos).then_some(())
+    });
+    assert_eq!(a.verdict("6", "go wrong"), Verdict::Stopped);
+    assert!(!driver.heard().contains(&"go wrong".to_owned()), "{:?}", driver.heard());
+    controller.order_estop(0, 0);
+    until("the release", || (a.verdict("6", "go on") == Verdict::Ok).then_some(()));
+}
