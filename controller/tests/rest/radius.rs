@@ -53,8 +53,11 @@ async fn a_robot_that_leaves_loses_its_task_when_its_mission_is_over_and_another
     task["spec"]["placement"] = json!({
         "on": "Robot", "at": {"x": 0, "y": 0}, "within": 5, "onOutOfRange": "Reschedule",
     });
-    assert_eq!(send(&admin, "POST", TASKS, task).await.0, 201);
     let near = [(&one, 0.5), (&two, 4.0)];
+    // Before it is known that the second is further away, either may get the task.
+    let far_one = format!("{G}/nodes/r2");
+    at(&near, cluster.until(&far_one, |node| node["status"]["pose"]["x"] == 4.0)).await;
+    assert_eq!(send(&admin, "POST", TASKS, task).await.0, 201);
     let placed = at(&near, cluster.until(T, |task| text(task, "/status/phase") == "Bound")).await;
     assert_eq!(text(&placed, "/status/node"), "r1");
     let uid = text(&placed, "/metadata/uid").to_owned();
