@@ -1,7 +1,7 @@
 //! Bodies, of a limited size: JSON, and what kubectl sends in protobuf.
 
 use axum::body::Body;
-use bytes::Bytes;
+use bytes::{Bytes, BytesMut};
 use http::{HeaderMap, StatusCode, header};
 use muster_api::validate::Violations;
 use serde::de::DeserializeOwned;
@@ -12,6 +12,8 @@ use super::protobuf::{self, PROTOBUF};
 
 /// As much as Kubernetes takes.
 const LIMIT: usize = 3 << 20;
+/// How much of a body that is too large is read before it is refused, bytes.
+const PATIENCE: usize = 4 * LIMIT;
 
 /// The media type of the body without its parameters, in lower case.
 pub(super) fn media_type(headers: &HeaderMap) -> String {
@@ -29,16 +31,28 @@ pub(super) fn unsupported(found: &str, supported: &str) -> Failure {
 
 /// The whole body.
 pub(super) async fn bytes(body: Body) -> Result<Bytes, Failure> {
-    use http_body_util::{BodyExt as _, LengthLimitError, Limited};
-    match Limited::new(body, LIMIT).collect().await {
-        Ok(collected) => Ok(collected.to_bytes()),
-        Err(error) if error.downcast_ref::<LengthLimitError>().is_some() => Err(Failure::new(
+    use http_body_util::BodyExt as _;
+    let (mut body, mut bytes, mut seen) = (body, BytesMut::new(), 0);
+    // What is too much is read a while longer, and dropped: who still writes does not read the answer.
+    while seen <= PATIENCE
+        && let Some(frame) = body.frame().await
+    {
+        let frame = frame
+            .map_err(|error| Failure::bad_request(format!("cannot read the body: {error}")))?;
+        let data = frame.into_data().unwrap_or_default();
+        seen += data.len();
+        if seen <= LIMIT {
+            bytes.extend_from_slice(&data);
+        }
+    }
+    if seen > LIMIT {
+        return Err(Failure::new(
             StatusCode::PAYLOAD_TOO_LARGE,
             "RequestEntityTooLarge",
             format!("the body is larger than {LIMIT} bytes"),
-        )),
-        Err(error) => Err(Failure::bad_request(format!("cannot read the body: {error}"))),
+        ));
     }
+    Ok(bytes.freeze())
 }
 
 /// A JSON body; a request that does not say what it sends is taken to send JSON.

@@ -69,7 +69,7 @@ use axum::Router;
 use axum::body::Body;
 use axum::extract::State;
 use axum::response::{IntoResponse as _, Response};
-use http::{HeaderValue, Request, StatusCode, header};
+use http::{HeaderValue, Method, Request, StatusCode, header};
 use serde_json::Value;
 use tokio::sync::Semaphore;
 
@@ -161,6 +161,16 @@ async fn dispatch(
         }
         Permission::Denied => return Err(Failure::forbidden(&identity.name(), verb, &target)),
     }
+    let request = match *request.method() {
+        Method::GET | Method::HEAD => request,
+        _ => {
+            // Whole, before anything of it is refused: who still writes when the answer comes does not read it, and
+            // sees a broken connection instead.
+            let (parts, body) = request.into_parts();
+            let bytes = body::bytes(body).await?;
+            Request::from_parts(parts, Body::from(bytes))
+        }
+    };
     let query = Query::read(request.uri())?;
     let call = Call { context, identity, query, request };
     match target {
