@@ -19,11 +19,14 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let sessions = protox::compile([package("framework"), package("executor")], [root])?;
     let poses = protox::compile([package("pose")], [root])?;
     let gate = protox::compile([package("gate")], [root])?;
+    let sensor = protox::compile([package("sensor")], [root])?;
     let plain = || tonic_prost_build::configure().build_client(false).build_server(false);
     // Values of Secrets, and tickets: `wire::secret` says how they are shown.
     plain()
         .bytes(".muster.agent.v1.Message.data")
         .bytes(".muster.agent.v1.File.data")
+        .bytes(".muster.agent.v1.ExecOutput")
+        .bytes(".muster.agent.v1.ExecInput")
         .skip_debug([
             ".muster.agent.v1.Variable",
             ".muster.agent.v1.File",
@@ -36,6 +39,10 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         .bytes(".muster.gate.v1.Command.data")
         .skip_debug([".muster.gate.v1.Register", ".muster.gate.v1.Seat"])
         .compile_fds(gate)?;
+    plain()
+        .bytes(".muster.sensor.v1.Frame.data")
+        .skip_debug([".muster.sensor.v1.Open"])
+        .compile_fds(sensor)?;
     plain()
         .bytes(".")
         .skip_debug([".muster.framework.v1.Direct"])

@@ -4,6 +4,10 @@
 //! |---|---|---|
 //! | main loop | supervisor | on shutdown |
 //! | link | session, the node's face | dropped on shutdown |
+//! | images | pulls before tasks need them | dropped on shutdown |
+//! | topics | ROS nodes that count for probes | dropped on shutdown |
+//! | simulator | the robot that is not there, and where it is | dropped on shutdown; its process stays |
+//! | sensors | sources that tasks read | when they are told to, before the agent does |
 //! | drivers | one task each | when their inbox closes; processes stay |
 
 use std::fs::{self, File};
@@ -13,8 +17,9 @@ use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::sync::Arc;
 
+use muster_api::id::TaskUid;
 use rustix::fs::FlockOperation;
-use tokio::sync::mpsc;
+use tokio::sync::{mpsc, watch};
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::AbortOnDropHandle;
 
@@ -31,18 +36,25 @@ use crate::executor::direct::Door;
 use crate::executor::work::WorkRuntime;
 use crate::footprint;
 use crate::gate;
-use crate::gate::keeper::{Keeper, end_former};
+use crate::gate::keeper::{Keeper, Standing, end_former};
 use crate::given::files::Place;
+use crate::images::Images;
+use crate::link::dial::Dialer;
 use crate::link::join::{self, Credentials, JoinError};
+use crate::link::orders::Orders;
 use crate::link::session::{Command, Link};
 use crate::link::token::{Token, TokenError};
 use crate::link::{Address, AddressError};
 use crate::node::{Enforced, Facts, Node};
+use crate::probe::topic::{Ros, Topics};
 use crate::runtime::Runtime;
 use crate::runtime::cgroup::Kernel;
 use crate::runtime::cgroup::hierarchy::Version;
 use crate::runtime::docker::{DockerConfig, DockerRuntime};
 use crate::runtime::process::{ProcessConfig, ProcessRuntime, Reexec};
+use crate::sensor::Sensors;
+use crate::sim;
+use crate::sim::keeper::Simulator;
 use crate::supervisor::Supervisor;
 
 /// Why the agent does not run.
@@ -256,14 +268,23 @@ pub async fn serve(
     } else {
         Some(Arc::new(Keeper::new(config.gate.clone(), gate_dir, &reexec)))
     };
+    let simulator = config.simulated.as_ref().map(|settings| {
+        Arc::new(Simulator::new(settings, config.data_dir.join(sim::DIR), &reexec))
+    });
     let desks = Arc::new(Desks::new(checkpoint.clone(), name.clone()));
     let works = WorkRuntime { desks: Arc::clone(&desks), contact: Arc::clone(&contact) };
+    let ros = Ros::new(&config, &name);
+    let sensors = Arc::new(Sensors::new(&config, &name));
     let shared = Arc::new(Shared {
         node: name,
         contact,
         desks,
+        execs: Arc::default(),
         works: Arc::new(works) as Arc<dyn Runtime>,
         gate: keeper.clone(),
+        sensors: Arc::clone(&sensors),
+        images: Images::default(),
+        topics: Arc::new(Topics::new(ros)),
         boot_id,
         checkpoint,
         files,
@@ -273,8 +294,8 @@ pub async fn serve(
         allocatable_memory: capacity.allocatable.memory.0,
     });
     let facts = Facts { kind, capacity, enforced, address: host_name() };
-    let node = Node::new(&config, facts, Arc::clone(&shared));
-    let files = shared.files.clone();
+    let node = Node::new(&config, facts, Arc::clone(&shared), simulator.as_deref());
+    let (files, execs) = (shared.files.clone(), Arc::clone(&shared.execs));
     let mut supervisor = Supervisor::new(Arc::clone(&shared));
     tracing::info!(node = %shared.node, tasks = records.len(), "started");
     shared.restore(&records)?;
@@ -288,17 +309,37 @@ pub async fn serve(
         );
     }
     let door = Door::new(config.messages.clone(), serving, Arc::clone(&shared.desks));
+    let dialer = Dialer { address, tls: Arc::new(credentials.tls()?) };
+    let orders = keeper.clone().map(|gate| Orders {
+        dialer: dialer.clone(),
+        gate,
+        heard: watch::Sender::default(),
+    });
     let link = Link {
-        address,
-        tls: Arc::new(credentials.tls()?),
+        ordered: orders.as_ref().map(|orders| orders.heard.subscribe()),
+        dialer,
         incarnation: uuid::Uuid::new_v4().to_string(),
         shared,
         commands,
     };
+    let images = Arc::clone(&link.shared);
+    let images =
+        AbortOnDropHandle::new(tokio::spawn(
+            async move { images.images.run(&*images.docker).await },
+        ));
+    let topics = Arc::clone(&link.shared.topics);
+    let topics = AbortOnDropHandle::new(tokio::spawn(async move { topics.run().await }));
+    let unread = CancellationToken::new();
+    let reading = unread.clone();
+    let reading = tokio::spawn(async move { sensors.run(reading).await });
     let engine = tokio::spawn(async move { docker.run().await });
+    // Before the gate, which looks for its drivers.
+    let simulator = simulator.map(|s| AbortOnDropHandle::new(tokio::spawn(s.run())));
     // It knows by now which tasks may live: what it says first does not take the robot from any of them.
     let gate = keeper.clone().map(|keeper| AbortOnDropHandle::new(tokio::spawn(keeper.run())));
+    let _orders = orders.map(|orders| AbortOnDropHandle::new(tokio::spawn(orders.run())));
     let session = tokio::spawn(link.run(node, door));
+    let mut standing = keeper.as_ref().map(|keeper| keeper.standing());
     let mut settled = false;
     loop {
         // Cancel-safe: receivers, a join and a token.
@@ -319,6 +360,7 @@ pub async fn serve(
                     break;
                 }
             },
+            task = given_back(&mut standing) => supervisor.give_back(&task),
             () = supervisor.ended() => {}
         }
     }
@@ -326,15 +368,32 @@ pub async fn serve(
     if let Some(keeper) = &keeper {
         keeper.leave().await;
     }
-    drop(gate);
+    drop((gate, simulator, images, topics));
+    // Its programs get the time to let their devices go.
+    unread.cancel();
     session.abort();
     engine.abort();
     let _ = (session.await, engine.await);
+    execs.end().await;
     supervisor.shut_down().await;
+    let _ = reading.await;
     retiree.retire();
     files.retire();
     tracing::info!("the agent ends; its tasks stay");
     Ok(())
+}
+
+/// The next task whose right to drive the gate gives back. Cancel-safe: what was seen was returned.
+async fn given_back(standing: &mut Option<watch::Receiver<Standing>>) -> TaskUid {
+    if let Some(standing) = standing {
+        while standing.changed().await.is_ok() {
+            if let Some(task) = standing.borrow_and_update().gives_back() {
+                return task;
+            }
+        }
+    }
+    // There is no gate, or its keeper has ended with the agent.
+    std::future::pending().await
 }
 
 fn make_data_dir(dir: &Path) -> Result<(), FileError> {

@@ -13,6 +13,15 @@ pub(crate) fn wall() -> Wall {
     Wall(jiff::Timestamp::now().as_millisecond())
 }
 
+/// Nanoseconds since the Unix epoch, and since boot, read together.
+pub(crate) fn stamp() -> (i64, u64) {
+    use rustix::time::{ClockId, Timespec, clock_gettime};
+    let nanos =
+        |time: Timespec| time.tv_sec.saturating_mul(1_000_000_000).saturating_add(time.tv_nsec);
+    let boot = nanos(clock_gettime(ClockId::Boottime));
+    (nanos(clock_gettime(ClockId::Realtime)), boot.unsigned_abs())
+}
+
 pub(crate) fn now() -> Now {
     Now { boot: boot(), wall: wall() }
 }

@@ -21,6 +21,10 @@ use crate::gauge::battery::BatterySource;
 use crate::position::PositionSource;
 use crate::position::settings::{PoseArgs, PoseSettings};
 use crate::runtime::process::attempt::LogBounds;
+use crate::sensor;
+use crate::sensor::settings::Source;
+use crate::sim;
+use crate::sim::settings::Settings as SimSettings;
 
 /// Where the Docker Engine listens when nobody says otherwise.
 const DOCKER_SOCKET: &str = "/var/run/docker.sock";
@@ -79,7 +83,8 @@ pub struct Args {
     #[arg(long, value_name = "NAME")]
     pub map: Option<String>,
     /// Where the robot is: `static:X,Y[,YAW]`, `file:PATH` with a line `X Y [YAW]` that the robot keeps up to date,
-    /// or `ros1:TOPIC` of type Odometry, PoseWithCovarianceStamped, PoseStamped or TFMessage [default: as given last]
+    /// `ros1:TOPIC` of type Odometry, PoseWithCovarianceStamped, PoseStamped or TFMessage, or `sim:WORLD`, a file with
+    /// the world of a robot that is simulated [default: as given last]
     #[arg(long, value_name = "SOURCE", allow_hyphen_values = true)]
     pub position: Option<String>,
     #[command(flatten)]
@@ -94,7 +99,7 @@ pub struct Args {
     #[arg(long, value_name = "M/S")]
     pub speed: Option<f64>,
     /// The robot's battery: `sysfs:NAME` as in /sys/class/power_supply, or `file:PATH` with a line
-    /// `PERCENT [charging]` that the robot keeps up to date [default: as given last]
+    /// `PERCENT [charging]` that the robot keeps up to date, or `sim` [default: as given last; a simulated robot's own]
     #[arg(long, value_name = "SOURCE")]
     pub battery: Option<String>,
     /// Run tasks with quotas even where the kernel cannot hold them to their quotas
@@ -139,6 +144,7 @@ struct FileConfig {
     log_max_files: Option<u32>,
     docker_socket: Option<String>,
     gate: GateSettings,
+    sensors: Vec<Source>,
     messages: Option<String>,
 }
 
@@ -160,12 +166,16 @@ pub struct Config {
     pub(crate) memory: Option<Bytes>,
     pub(crate) speed: Option<f64>,
     pub(crate) battery: Option<BatterySource>,
+    /// The world of a robot that is simulated.
+    pub(crate) simulated: Option<SimSettings>,
     pub(crate) unenforced_quotas: bool,
     pub(crate) log: LogBounds,
     /// Absent: no Docker.
     pub(crate) docker_socket: Option<PathBuf>,
     /// The drivers of the actuators.
     pub(crate) gate: GateSettings,
+    /// Where the sensors' functions come from.
+    pub(crate) sources: Vec<Source>,
     pub(crate) messages: Where,
     /// To be kept for the next start.
     pub(crate) declared: Declared,
@@ -229,7 +239,10 @@ impl Args {
             sr_res: self.sr_res.or(file.sr_res),
             ar_res: self.ar_res.or(file.ar_res),
             map: self.map.or(file.map),
-            position: self.position.or(file.position),
+            position: match self.position {
+                Some(text) => Some(whole(text, None)),
+                None => file.position.map(|text| whole(text, self.config.as_deref())),
+            },
             pose,
             cpu: self.cpu.or(file.cpu),
             memory: self.memory.or(file.memory),
@@ -248,13 +261,27 @@ impl Args {
                 "a cloud node has no sensors and no actuators; use --kind robot".to_owned();
             return Err(ConfigError::Field { field: "--kind", reason });
         }
-        file.gate.check(&actuators).map_err(|error| {
+        let of_file = |field, error: &dyn std::error::Error| {
             let reason = match &self.config {
-                Some(path) => format!("{error} ({})", path.display()),
-                None => error.to_string(),
+                Some(path) => format!("{} ({})", crate::driver::chain(error), path.display()),
+                None => crate::driver::chain(error),
             };
-            ConfigError::Field { field: "gate", reason }
-        })?;
+            ConfigError::Field { field, reason }
+        };
+        let position = parsed("--position", &declared.position)?;
+        let simulated = match &position {
+            Some(PositionSource::Sim(world)) => {
+                Some(SimSettings::read(world).map_err(|e| field("--position")(&e))?)
+            }
+            _ => None,
+        };
+        let simulator = simulated.as_ref().map(|_| data_dir.join(sim::DIR));
+        let gate_error = |error| of_file("gate", &error);
+        file.gate.check(&actuators).map_err(gate_error)?;
+        let gate = file.gate.simulate(simulator.as_deref()).map_err(gate_error)?;
+        sensor::settings::check(&file.sensors, &sensors, simulated.is_some())
+            .map_err(|e| of_file("sensors", &e))?;
+        let battery = battery(&declared.battery, simulated.as_ref())?;
         let name = self.name.or(file.name);
         let socket = self.docker_socket.or(file.docker_socket);
         Ok(Config {
@@ -266,7 +293,7 @@ impl Args {
             labels: declared.labels.clone().unwrap_or_default(),
             sensors,
             actuators,
-            position: parsed("--position", &declared.position)?,
+            position,
             pose: declared
                 .pose
                 .resolve()
@@ -274,8 +301,9 @@ impl Args {
             map: declared.map.clone().unwrap_or_else(|| DEFAULT_MAP.to_owned()),
             cpu: parsed("--cpu", &declared.cpu)?,
             memory: parsed("--memory", &declared.memory)?,
-            speed: speed(declared.speed)?,
-            battery: parsed("--battery", &declared.battery)?,
+            speed: speed(declared.speed)?.or_else(|| simulated.as_ref().map(SimSettings::speed)),
+            battery,
+            simulated,
             unenforced_quotas: self.unenforced_quotas || file.unenforced_quotas,
             log: log_bounds(
                 self.log_max_size.or(file.log_max_size),
@@ -286,7 +314,8 @@ impl Args {
                 Some(path) => Some(PathBuf::from(path)),
                 None => Some(PathBuf::from(DOCKER_SOCKET)),
             },
-            gate: file.gate,
+            gate,
+            sources: file.sensors,
             messages: parsed("--messages", &self.messages.or(file.messages))?.unwrap_or_default(),
             declared,
             remembered,
@@ -318,6 +347,35 @@ where
     T: FromStr<Err: std::error::Error + 'static>,
 {
     text.as_deref().map(|text| text.parse().map_err(|e| field(flag)(&e))).transpose()
+}
+
+/// A simulated robot has its own battery, unless it is said otherwise.
+fn battery(
+    text: &Option<String>,
+    simulated: Option<&SimSettings>,
+) -> Result<Option<BatterySource>, ConfigError> {
+    let simulates = simulated.is_some_and(SimSettings::has_battery);
+    match parsed("--battery", text)? {
+        Some(BatterySource::Sim) if !simulates => {
+            let reason =
+                "the robot is not simulated, or its world gives it no battery; leave it out";
+            Err(ConfigError::Field { field: "--battery", reason: reason.to_owned() })
+        }
+        None if simulates => Ok(Some(BatterySource::Sim)),
+        source => Ok(source),
+    }
+}
+
+/// The world of `sim:` as a whole path: a file's is beside the file, a flag's in the working directory. It is remembered, and the
+/// next start may be elsewhere.
+fn whole(position: String, config: Option<&Path>) -> String {
+    match position.strip_prefix("sim:") {
+        Some(world) if !world.is_empty() => {
+            let dir = config.and_then(Path::parent).unwrap_or_else(|| Path::new(""));
+            format!("sim:{}", absolute(dir.join(world)).display())
+        }
+        _ => position,
+    }
 }
 
 fn log_bounds(size: Option<String>, files: Option<u32>) -> Result<LogBounds, ConfigError> {
@@ -431,6 +489,16 @@ mod tests {
         assert_eq!(config.labels.len(), 2);
         assert_eq!(config.docker_socket, None);
         assert_eq!(config.map, "map");
+    }
+
+    #[test]
+    fn the_lab_s_robot_is_simulated() {
+        let lab = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../manifests/lab"));
+        let config = Args { config: Some(lab.join("agent.yaml")), ..args() }.resolve().unwrap();
+        assert_eq!(config.position, Some(PositionSource::Sim(lab.join("world.yaml"))));
+        assert_eq!((config.speed, &config.battery), (Some(0.5), &Some(BatterySource::Sim)));
+        let args = Args { battery: Some("sim".into()), ..args() };
+        assert!(args.resolve().unwrap_err().to_string().starts_with("--battery"));
     }
 
     #[test]

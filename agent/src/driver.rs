@@ -30,15 +30,21 @@ use crate::clock;
 use crate::contact::Contact;
 use crate::depends::Others;
 use crate::durable::FileError;
+use crate::exec::Execs;
 use crate::executor;
 use crate::executor::desk::Desks;
 use crate::executor::seat::Seat;
 use crate::gate::keeper::Keeper;
 use crate::given;
 use crate::given::files::Place;
+use crate::images::Images;
 use crate::probe::Probing;
+use crate::probe::topic::Topics;
 use crate::runtime::launch::Lease;
 use crate::runtime::{AttemptId, Launch, Launched, Runtime};
+use crate::sensor;
+use crate::sensor::Sensors;
+use crate::sensor::talk::Owner;
 use crate::spec::{self, Kind, Surroundings};
 
 /// Between two tries to make a record durable. Nothing else of the task happens meanwhile: a disk
@@ -58,11 +64,18 @@ pub(crate) struct Shared {
     pub(crate) board: Board,
     pub(crate) contact: Arc<Contact>,
     pub(crate) desks: Arc<Desks>,
+    pub(crate) execs: Arc<Execs>,
     pub(crate) process: Arc<dyn Runtime>,
     pub(crate) docker: Arc<dyn Runtime>,
     pub(crate) works: Arc<dyn Runtime>,
     /// Absent: nothing stands before the drivers.
     pub(crate) gate: Option<Arc<Keeper>>,
+    /// Those that have a source.
+    pub(crate) sensors: Arc<Sensors>,
+    /// Those that the node is to have before a task needs them.
+    pub(crate) images: Images,
+    /// Those that probes look at.
+    pub(crate) topics: Arc<Topics>,
     /// Memory that tasks may reserve, bytes.
     pub(crate) allocatable_memory: u64,
 }
@@ -88,6 +101,7 @@ impl Shared {
             task_dir: &task_dir,
             token: &record.token,
             gate: gate.as_deref(),
+            sensors: self.sensors.serves(&record.assignment.spec.resources.sensors),
             unreserved: self.allocatable_memory.saturating_sub(others),
         };
         let id = AttemptId { uid: workload.uid.clone(), attempt: workload.attempt };
@@ -156,6 +170,8 @@ pub(crate) struct Driver {
     files: bool,
     /// While processes of the task may exist: it may be an executor.
     seat: Option<Seat>,
+    /// While processes of an attempt may exist that asked for sensors.
+    sensing: Option<sensor::seat::Seat>,
     /// While an attempt runs that has probes.
     probing: Option<Probing>,
     /// The tasks that it waits for.
@@ -227,6 +243,7 @@ pub(crate) async fn drive(
         unkept,
         files,
         seat: None,
+        sensing: None,
         probing: None,
         others,
         dropped: false,
@@ -326,7 +343,7 @@ impl Driver {
     async fn attend(&mut self) {
         self.shared.admit(&self.record);
         if !self.record.workload.state.may_be_live() {
-            self.seat = None;
+            (self.seat, self.sensing) = (None, None);
             if self.files {
                 self.clear_files().await;
             }
@@ -354,6 +371,29 @@ impl Driver {
         }
     }
 
+    /// Lets the task read the sensors that it asked for, before it is started. After its record is durable, as above.
+    fn sense(&mut self) {
+        let (workload, spec) = (&self.record.workload, &self.record.assignment.spec);
+        self.sensing.take_if(|seat| seat.attempt != workload.attempt);
+        let (sensors, functions) = (&self.shared.sensors, &spec.resources.sensors);
+        // A work reads by its executor, which is a task of its own.
+        let asks = Kind::of(spec) != Kind::Work && sensors.serves(functions);
+        if workload.state.may_be_live() && self.sensing.is_none() && asks {
+            let dir = self.shared.checkpoint.task_dir(&workload.uid).join(sensor::DIR);
+            let owner = Owner {
+                runtime: Arc::clone(&self.runtime),
+                id: self.id(),
+                token: self.record.token.clone(),
+            };
+            match sensor::seat::Seat::open(sensors, &dir, functions, owner) {
+                Ok(seat) => self.sensing = Some(seat),
+                Err(error) => {
+                    tracing::warn!(id = %self.id(), %error, "no sensors for this task");
+                }
+            }
+        }
+    }
+
     /// Probes what runs, and nothing else. Before anything is told or ended: no check outlives its attempt.
     async fn probe(&mut self) {
         let workload = &self.record.workload;
@@ -364,18 +404,22 @@ impl Driver {
         }
         if self.probing.is_none() {
             let (workload, spec) = (&self.record.workload, &self.record.assignment.spec);
-            self.probing = Probing::begin(workload, spec, &self.runtime, || self.launch());
+            let with = (&self.runtime, &self.shared.topics);
+            self.probing = Probing::begin(workload, spec, with, || self.launch());
         }
     }
 
     async fn carry_out(&mut self, response: Response) {
         self.attend().await;
         self.probe().await;
+        // As checks: no client's program outlives the attempt that it was run in.
+        self.shared.execs.settle(&self.record.workload).await;
         for effect in response.effects {
             match effect {
                 Effect::Persist => {
                     self.persist().await;
                     self.listen();
+                    self.sense();
                 }
                 Effect::Publish => publish(&self.shared, &self.record),
                 Effect::WakeAt(at) => {
@@ -598,8 +642,12 @@ mod tests {
             board: Board::default(),
             contact: Arc::new(Contact::open(&dir.path().join("contact"), "b").unwrap()),
             desks,
+            execs: Arc::default(),
             works: Arc::clone(fake) as Arc<dyn Runtime>,
             gate: None,
+            sensors: Arc::default(),
+            images: Images::default(),
+            topics: Arc::default(),
             process: Arc::clone(fake) as Arc<dyn Runtime>,
             docker: Arc::clone(fake) as Arc<dyn Runtime>,
             allocatable_memory: 1 << 30,

@@ -11,13 +11,18 @@
 //! | `config` | flags and `agent.yaml` |
 //! | `declared` | what the node said of itself, for its next start |
 //! | `app` | starts, joins and ends everything |
+//! | [`assigned`] | what the controller sends, decoded |
 //! | `supervisor`, `driver` | what `muster-agent-core` decides, carried out |
 //! | `checkpoint`, `durable` | what survives the agent |
 //! | `board` | what tasks show of themselves |
 //! | `depends` | the tasks that a task waits for |
+//! | `images` | images that are pulled before a task needs them |
 //! | `given` | what tasks are given of ConfigMaps and Secrets |
+//! | `exec` | programs that clients run in tasks |
 //! | `executor` | tasks that run other tasks, over a socket of their own |
 //! | `gate` | the process that alone talks to the drivers, and what the agent tells it |
+//! | [`sim`] | the process that is the robot, where there is none |
+//! | `sensor` | sources that are read once, for every task that asked for them |
 //! | `gauge` | what is read off the machine: battery, disk, labels |
 //! | `footprint` | memory that is given back after the start |
 //! | `contact` | when the controller was last heard, for the shims too |
@@ -28,6 +33,7 @@
 //! | `runtime`, `shim` | what runs tasks |
 
 mod app;
+pub mod assigned;
 mod board;
 mod capacity;
 mod checkpoint;
@@ -38,20 +44,25 @@ mod declared;
 mod depends;
 mod driver;
 mod durable;
+mod exec;
 mod executor;
 mod footprint;
 pub mod gate;
 mod gauge;
 mod given;
+mod images;
 mod link;
 mod mission;
 mod node;
 mod position;
 mod probe;
 mod runtime;
+mod sensor;
 pub mod shim;
+pub mod sim;
 mod spec;
 mod supervisor;
 
 pub use app::{AgentError, run, serve};
+pub use link::report::to_wire as report_to_wire;
 pub use runtime::process::Reexec;

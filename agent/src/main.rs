@@ -3,7 +3,7 @@
 use std::process::ExitCode;
 
 use clap::Parser;
-use muster_agent::{Reexec, config, gate, shim};
+use muster_agent::{Reexec, config, gate, shim, sim};
 use tracing_subscriber::EnvFilter;
 
 /// Runs tasks on this robot or cloud server, held to their quotas.
@@ -16,10 +16,11 @@ struct Cli {
 
 fn main() -> ExitCode {
     let mut args = std::env::args_os();
-    // Before anything else: shim and gate must stay small, and they have no use for the rest.
+    // Before anything else: shim, gate and simulator must stay small, and they have no use for the rest.
     match args.nth(1) {
         Some(verb) if verb == shim::VERB => shim::main(args),
         Some(verb) if verb == gate::VERB => gate::main(args),
+        Some(verb) if verb == sim::VERB => sim::main(args),
         _ => {}
     }
     let cli = Cli::parse();

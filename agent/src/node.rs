@@ -19,11 +19,12 @@ use tokio::time::Instant;
 use crate::capacity::{Capacity, Machine};
 use crate::config::{Config, Kind};
 use crate::driver::Shared;
-use crate::gauge::battery::{BatteryGauge, BatterySource};
+use crate::gauge::battery::BatteryGauge;
 use crate::gauge::disk::DiskGauge;
 use crate::gauge::machine;
 use crate::mission;
 use crate::position::Position;
+use crate::sim::keeper::Simulator;
 
 /// Between two live poses. A robot at 1.5 m/s moves 15 cm in it, less than placement by distance can care for.
 const POSE_EVERY: Duration = Duration::from_millis(100);
@@ -61,7 +62,12 @@ pub(crate) struct Enforced {
 }
 
 impl Node {
-    pub(crate) fn new(config: &Config, facts: Facts, shared: Arc<Shared>) -> Node {
+    pub(crate) fn new(
+        config: &Config,
+        facts: Facts,
+        shared: Arc<Shared>,
+        simulator: Option<&Simulator>,
+    ) -> Node {
         let fixed = NodeReport {
             kind: facts.kind.into(),
             labels: labels(config),
@@ -77,16 +83,16 @@ impl Node {
             battery: None,
             mission_locks: Vec::new(),
             estop: None,
+            images: Vec::new(),
         };
         let position = match facts.kind {
-            Kind::Robot => config
-                .position
-                .as_ref()
-                .map(|source| source.open(&config.map, shared.node.as_str(), &config.pose)),
+            Kind::Robot => config.position.as_ref().and_then(|source| {
+                source.open(&config.map, shared.node.as_str(), &config.pose, simulator)
+            }),
             Kind::Cloud => None,
         };
         let battery = match facts.kind {
-            Kind::Robot => config.battery.as_ref().map(BatterySource::open),
+            Kind::Robot => config.battery.as_ref().and_then(|source| source.open(simulator)),
             Kind::Cloud => None,
         };
         let disk = DiskGauge::open(&config.data_dir);
@@ -143,6 +149,7 @@ impl Node {
                 );
             }
         }
+        conditions.extend(self.shared.sensors.condition());
         let battery = self.battery.as_ref().and_then(BatteryGauge::charge);
         let mission_locks =
             mission::locks(&self.data_dir, &self.shared.checkpoint, self.shared.board.live());
@@ -160,6 +167,7 @@ impl Node {
             battery,
             mission_locks,
             estop,
+            images: self.shared.images.states(),
             ..self.fixed.clone()
         };
         let mut state = proto::NodeState::from(&report);

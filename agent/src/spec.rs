@@ -16,6 +16,7 @@ use crate::probe;
 use crate::runtime::launch::{
     AttemptId, Container, Launch, Lease, Limits, Mount, Network, Program, Pull, Work,
 };
+use crate::sensor;
 
 /// Processes and threads of a task that names no limit: enough for a large ROS graph, and far from
 /// what a fork bomb needs to take a robot down.
@@ -97,6 +98,8 @@ pub(crate) struct Surroundings<'a> {
     pub(crate) token: &'a str,
     /// Where the gate's socket for tasks is, if there is a gate.
     pub(crate) gate: Option<&'a Path>,
+    /// Some sensor that the task asks for has a source.
+    pub(crate) sensors: bool,
     /// Memory that nobody reserved, bytes.
     pub(crate) unreserved: u64,
 }
@@ -120,6 +123,16 @@ pub(crate) fn launch(id: AttemptId, assignment: &Assignment, around: &Surroundin
         grace_ms: u64::from(spec.grace_period_seconds) * 1_000,
         stop_after_ms: desired(spec, None).stop_after_ms,
         id,
+    }
+}
+
+impl From<task::PullPolicy> for Pull {
+    fn from(policy: task::PullPolicy) -> Self {
+        match policy {
+            task::PullPolicy::Always => Pull::Always,
+            task::PullPolicy::IfNotPresent => Pull::IfNotPresent,
+            task::PullPolicy::Never => Pull::Never,
+        }
     }
 }
 
@@ -167,6 +180,11 @@ fn environment(
         env.insert(gate::SOCKET_ENV.to_owned(), dir.join(gate::SOCKET).display().to_string());
         env.insert(gate::TOKEN_ENV.to_owned(), around.token.to_owned());
     }
+    if around.sensors {
+        let dir = around.task_dir.join(sensor::DIR).display().to_string();
+        env.insert(sensor::DIR_ENV.to_owned(), dir);
+        env.insert(sensor::TOKEN_ENV.to_owned(), around.token.to_owned());
+    }
     env
 }
 
@@ -182,6 +200,7 @@ fn program(assignment: &Assignment) -> (Program, BTreeMap<String, String>) {
             namespace: assignment.namespace.clone(),
             name: assignment.name.clone(),
             executor: run.task.clone(),
+            framework: assignment.framework.as_ref().map(|framework| framework.id.clone()),
             data: run.data.clone(),
             lease: assignment.lease.as_deref().and_then(Lease::from_text),
         };
@@ -208,11 +227,7 @@ fn program(assignment: &Assignment) -> (Program, BTreeMap<String, String>) {
                 task::Network::Bridge => Network::Bridge,
             },
             user: None,
-            pull: match run.pull_policy {
-                task::PullPolicy::Always => Pull::Always,
-                task::PullPolicy::IfNotPresent => Pull::IfNotPresent,
-                task::PullPolicy::Never => Pull::Never,
-            },
+            pull: run.pull_policy.into(),
         });
         return (program, variables(&run.env));
     }

@@ -3,20 +3,17 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use muster_agent_core::depend::Dependency;
-use muster_agent_core::desired::{Desired, StopOrder};
-use muster_agent_core::plan::{self, Assignments, Skipped, Step};
+use muster_agent_core::plan::{self, Skipped, Step};
 use muster_agent_core::workload::Event;
 use muster_api::id::TaskUid;
-use muster_api::wire::WireError;
+use muster_api::kind::task::TaskSpec;
 use muster_api::wire::agent::v1 as proto;
-use muster_api::wire::agent_session::dependency_condition_from_wire;
 use tokio::sync::mpsc;
 use tokio::task::JoinSet;
 
+use crate::assigned::decode;
 use crate::checkpoint::{Assignment, Framework, Record};
 use crate::driver::{Begin, Message, Shared, drive};
-use crate::spec;
 
 /// All tasks of this node.
 #[derive(Debug)]
@@ -61,7 +58,8 @@ impl Supervisor {
 
     /// Takes the controller's assignments.
     pub(crate) fn assign(&mut self, message: proto::Assignments) {
-        let (assignments, mut details) = decode(message, &self.tasks);
+        let known = |uid: &TaskUid| self.tasks.contains_key(uid);
+        let (assignments, mut details) = decode(message, known, assignment);
         let known = self.tasks.iter().map(|(uid, task)| (uid.clone(), task.forgotten)).collect();
         let plan = plan::plan(assignments, &known);
         for skipped in plan.skipped {
@@ -105,6 +103,12 @@ impl Supervisor {
         }
     }
 
+    /// The gate heard nothing of this task, which drove, and gives its right to drive back.
+    pub(crate) fn give_back(&self, uid: &TaskUid) {
+        tracing::warn!(%uid, "whoever drives is silent for too long; its task is ended");
+        self.tell(uid, Message::Event(Event::GivenBack));
+    }
+
     fn tell(&self, uid: &TaskUid, message: Message) {
         if let Some(task) = self.tasks.get(uid) {
             // Closed: the driver has just dropped its task.
@@ -134,90 +138,16 @@ impl Supervisor {
     }
 }
 
-type Details = BTreeMap<TaskUid, Assignment>;
-
-fn decode(message: proto::Assignments, known: &BTreeMap<TaskUid, Task>) -> (Assignments, Details) {
-    let mut assignments = Assignments {
-        complete: message.complete,
-        released: message.released.into_iter().map(TaskUid::new).collect(),
-        kept: message.kept.into_iter().map(TaskUid::new).collect(),
-        ..Assignments::default()
-    };
-    let mut details = BTreeMap::new();
-    for wire in message.upserts {
-        let uid = TaskUid::new(wire.uid);
-        if !is_file_name(&uid) {
-            tracing::error!(%uid, "an assignment's uid is refused");
-            continue;
-        }
-        if wire.ended && !known.contains_key(&uid) {
-            // Nothing of it is here, and it must not begin.
-            continue;
-        }
-        let assignment = |spec| Assignment {
-            namespace: wire.namespace.clone(),
-            name: wire.name.clone(),
-            spec,
-            lease: wire.lease.as_ref().map(lease_text),
-            framework: wire
-                .framework
-                .clone()
-                .map(|proto::Framework { id, name }| Framework { id, name }),
-            given: wire.config.clone().map(Arc::new),
-        };
-        let task_spec = match spec::read(&wire.spec) {
-            Ok(task_spec) => task_spec,
-            Err(error) => {
-                details.insert(uid.clone(), assignment(spec::nothing()));
-                assignments.unreadable.insert(uid, error.to_string());
-                continue;
-            }
-        };
-        let mut stop = wire.stop.as_ref().map(|stop| StopOrder {
-            grace_ms: stop.grace_period_ms.into(),
-            reason: stop.reason.clone(),
-        });
-        if wire.ended {
-            let grace_ms = u64::from(task_spec.grace_period_seconds) * 1_000;
-            let reason = "its end is recorded".to_owned();
-            stop = stop.or(Some(StopOrder { grace_ms, reason }));
-        }
-        let depends: Result<Vec<Dependency>, WireError> =
-            wire.dependencies.iter().map(dependency).collect();
-        let depends = match depends {
-            Ok(depends) => depends,
-            Err(error) => {
-                details.insert(uid.clone(), assignment(spec::nothing()));
-                assignments.unreadable.insert(uid, error.to_string());
-                continue;
-            }
-        };
-        let attempts = Some(wire.attempts).filter(|attempts| *attempts > 0);
-        let desired = Desired { depends, attempts, ..spec::desired(&task_spec, stop) };
-        assignments.upserts.insert(uid.clone(), desired);
-        details.insert(uid, assignment(task_spec));
+fn assignment(wire: &proto::Assignment, spec: TaskSpec) -> Assignment {
+    let framework = wire.framework.clone();
+    Assignment {
+        namespace: wire.namespace.clone(),
+        name: wire.name.clone(),
+        spec,
+        lease: wire.lease.as_ref().map(lease_text),
+        framework: framework.map(|proto::Framework { id, name }| Framework { id, name }),
+        given: wire.config.clone().map(Arc::new),
     }
-    (assignments, details)
-}
-
-fn dependency(wire: &proto::Dependency) -> Result<Dependency, WireError> {
-    Ok(Dependency {
-        task: wire.task.clone(),
-        uid: wire.uid.clone(),
-        condition: dependency_condition_from_wire(wire.condition)?,
-        restart: wire.restart,
-        unmet: (!wire.met).then(|| wire.unmet.clone()),
-        attempt: wire.attempt,
-    })
-}
-
-/// A uid names a directory and a group: it must not lead out of them.
-fn is_file_name(uid: &TaskUid) -> bool {
-    let text = uid.as_str();
-    !text.is_empty()
-        && text.len() <= 200
-        && !text.starts_with('.')
-        && text.bytes().all(|byte| byte.is_ascii_alphanumeric() || b"-_.".contains(&byte))
 }
 
 fn lease_text(lease: &proto::LeaseToken) -> String {
@@ -229,62 +159,6 @@ fn lease_text(lease: &proto::LeaseToken) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn uids_stay_in_their_directory() {
-        for good in ["a", "0f3c-1", "a.b"] {
-            assert!(is_file_name(&TaskUid::new(good)), "{good}");
-        }
-        for bad in ["", "..", ".a", "a/b", "a b", "ü"] {
-            assert!(!is_file_name(&TaskUid::new(bad)), "{bad}");
-        }
-    }
-
-    #[test]
-    fn a_recorded_end_never_begins() {
-        let wire = proto::Assignment {
-            uid: "a".to_owned(),
-            spec: br#"{"run":{"process":{"command":["true"]}}}"#.to_vec(),
-            ended: true,
-            ..proto::Assignment::default()
-        };
-        let message =
-            proto::Assignments { complete: true, upserts: vec![wire], ..Default::default() };
-        let (assignments, _) = decode(message.clone(), &BTreeMap::new());
-        assert!(assignments.upserts.is_empty());
-        let (inbox, _messages) = mpsc::unbounded_channel();
-        let known = BTreeMap::from([(TaskUid::new("a"), Task { inbox, forgotten: false })]);
-        let (assignments, _) = decode(message, &known);
-        assert!(assignments.upserts[&TaskUid::new("a")].stop.is_some());
-    }
-
-    #[test]
-    fn what_cannot_be_read_is_named_with_its_field() {
-        let cases: [(&[u8], &str); 5] = [
-            (br#"{"run":{"wasm":{"module":"x"}}}"#, "wasm"),
-            (br#"{"run":{}}"#, "run"),
-            (br#"{"run":{"process":{}}}"#, "run.process: missing field `command`"),
-            (
-                br#"{"run":{"process":{"command":["true"]}},"restartPolicy":"Hourly"}"#,
-                "restartPolicy",
-            ),
-            (b"not json", "assignment.spec"),
-        ];
-        for (spec, field) in cases {
-            let wire = proto::Assignment {
-                uid: "a".to_owned(),
-                name: "t".to_owned(),
-                spec: spec.to_vec(),
-                ..proto::Assignment::default()
-            };
-            let message = proto::Assignments { upserts: vec![wire], ..Default::default() };
-            let (assignments, details) = decode(message, &BTreeMap::new());
-            let why = &assignments.unreadable[&TaskUid::new("a")];
-            assert!(why.contains(field), "{why}");
-            assert!(assignments.upserts.is_empty());
-            assert_eq!(details[&TaskUid::new("a")].name, "t");
-        }
-    }
 
     #[test]
     fn leases_as_text() {

@@ -130,6 +130,47 @@ fn works_run_end_and_are_ended_and_the_limits_follow() {
     );
 }
 
+#[test]
+fn nothing_waits_behind_messages() {
+    let controller = Controller::start();
+    let agent = Agent::start(&controller);
+    let mut executor = two_works(&controller, &agent);
+    controller.set_stuck_messages(true);
+    let large = vec![7; 4 << 20];
+    let words = ["first", "second"];
+    executor.say(Say::Message(proto::Message { data: words[0].into() }));
+    executor.say(Say::Message(proto::Message { data: large.clone().into() }));
+    executor.say(Say::Message(proto::Message { data: words[1].into() }));
+    executor.update("w1", TaskState::Failed);
+    controller.wait_end("w1");
+    let beats = controller.beats();
+    until("heartbeats", || (controller.beats() > beats + 5).then_some(()));
+    controller.message("exec", b"to it".to_vec());
+    let told = until("a message", || match executor.hear() {
+        Heard::Message(message) => Some(message.data),
+        _ => None,
+    });
+    assert_eq!(told, "to it");
+    assert!(controller.messages().len() <= 1, "the first was asked for before");
+    controller.set_stuck_messages(false);
+    let heard = until("all", || Some(controller.messages()).filter(|all| all.len() == 3));
+    assert!(heard[1].data == large);
+    assert_eq!([&heard[0].data, &heard[2].data], words);
+}
+
+#[test]
+fn who_does_not_read_its_acknowledgements_is_not_heard_without_end() {
+    let controller = Controller::start();
+    let agent = Agent::start(&controller);
+    let mut executor = two_works(&controller, &agent);
+    // Of a work that it does not have: it is acknowledged without a look at the disk.
+    let many = 400_000;
+    let taken = executor.flood("?", many);
+    assert!(taken < many, "all were taken, and the answers wait in memory");
+    controller.stop("exec", 0);
+    controller.wait_end("exec");
+}
+
 /// An executor that ends with 0 when `file` is there, and with 3 when it is signalled.
 fn assign_watching(controller: &Controller, file: &std::path::Path) {
     let script =

@@ -115,6 +115,56 @@ fn a_holder_that_is_silent_is_stopped() {
 }
 
 #[test]
+fn the_task_of_a_holder_that_stays_silent_is_ended() {
+    let ladder = "  ladder: [{after: 100ms, action: Stop}, {after: 300ms, action: Release}]\n";
+    let (controller, driver) = (Controller::start(), Driver::new(ladder));
+    let agent = robot(&controller, &driver);
+    let mut a = Holder::register(&agent, "a");
+    assert_eq!(a.verdict("6", "go"), Verdict::Ok);
+    let end = controller.wait_end("a");
+    assert!(end.message.contains("was silent for too long"), "{end:?}");
+    assert_eq!(driver.heard().last().map(String::as_str), Some("stop"));
+    assert!(controller.reports("b").iter().all(|report| report.message.is_empty()));
+}
+
+#[test]
+fn a_stop_does_not_wait_for_an_agent_that_cannot_speak() {
+    let (controller, driver) = (Controller::start(), Driver::new(PATIENT));
+    let agent = robot(&controller, &driver);
+    let mut a = Holder::register(&agent, "a");
+    assert_eq!(a.verdict("6", "go"), Verdict::Ok);
+    driver.wait("go");
+    controller.assign(
+        "talker",
+        json!({"run": {"process": {"command": ["sh", "-c", "yes muster | head -c 33554432; sleep 1000"]}}}),
+    );
+    controller.wait_running("talker");
+    controller.set_stuck(true);
+    let said = controller.beats();
+    controller.ask_logs(agent_proto::LogRequest {
+        id: 1,
+        uid: "talker".to_owned(),
+        follow: true,
+        ..Default::default()
+    });
+    // What it would say next waits for room that there is not: a session that takes orders in turn would not take this.
+    let (mut before, mut looks) = (0, 0);
+    until("it to be stuck", || {
+        let now = agent.bytes_read();
+        looks = if now == before { looks + 1 } else { 0 };
+        before = now;
+        (looks >= 60).then_some(())
+    });
+    controller.order_estop(1, 0);
+    driver.wait("stop");
+    assert_eq!(a.verdict("6", "go wrong"), Verdict::Stopped);
+    assert!(controller.beats() <= said + 1, "it was not heard meanwhile");
+    assert_eq!(controller.hellos().len(), 1, "in the same session");
+    controller.set_stuck(false);
+    until("its word", || (controller.state()?.estop?.tier == 1).then_some(()));
+}
+
+#[test]
 fn the_robot_stands_without_its_agent_and_goes_on_with_the_next() {
     let (controller, driver) = (Controller::start(), Driver::new(PATIENT));
     let mut agent = robot(&controller, &driver);

@@ -19,6 +19,7 @@ CONTRACTS = [
     "muster/framework/v1/framework.proto",
     "muster/executor/v1/executor.proto",
     "muster/gate/v1/gate.proto",
+    "muster/sensor/v1/sensor.proto",
 ]
 # Below a package of their own: what stands directly in `muster` is the SDK.
 GENERATED = "muster/_proto"

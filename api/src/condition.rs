@@ -77,6 +77,8 @@ pub const EMERGENCY_STOP: &str = "EmergencyStop";
 pub const POSE_FRESH: &str = "PoseFresh";
 /// The robot knows where it is.
 pub const LOCALIZED: &str = "Localized";
+/// Every sensor that a task of the node asked for, and that has a source, delivers.
+pub const SENSORS_READY: &str = "SensorsReady";
 /// Quotas of tasks are enforced by the kernel on this node (invariant 7).
 pub const QUOTAS_ENFORCED: &str = "QuotasEnforced";
 

@@ -170,6 +170,13 @@ impl FunctionName {
         }
     }
 
+    /// Where a task finds it among files: `kinect/ImageGen`. Slashes of a name are underscores there, so that two names may have
+    /// one path.
+    #[must_use]
+    pub fn path(&self) -> String {
+        format!("{}/{}", self.device.replace('/', "_"), self.function.replace('/', "_"))
+    }
+
     /// The device, `kinect`.
     #[must_use]
     pub fn device(&self) -> &str {

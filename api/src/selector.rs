@@ -298,7 +298,9 @@ impl FieldSelector {
     }
 }
 
-fn field_text(object: &serde_json::Value, path: &str) -> String {
+/// The value at a path as selectors compare it; a missing one is empty.
+#[must_use]
+pub fn field_text(object: &serde_json::Value, path: &str) -> String {
     let found = path.split('.').try_fold(object, |value, step| value.get(step));
     match found {
         None | Some(serde_json::Value::Null) => String::new(),

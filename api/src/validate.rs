@@ -81,9 +81,17 @@ impl fmt::Display for Violation {
     }
 }
 
-/// Everything found wrong with one object, in the order of finding.
+/// As many findings as are told. Who has more than this wrong starts with these; an object may hold a million.
+pub const MOST: usize = 100;
+/// The longest name, bytes, for which one is looked up that was meant.
+const LONGEST: usize = 64;
+
+/// What was found wrong with one object, in the order of finding; [`MOST`] at most.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub struct Violations(Vec<Violation>);
+pub struct Violations {
+    /// The one after the last stands for all that were found later, and is told nobody.
+    found: Vec<Violation>,
+}
 
 impl Violations {
     /// None yet.
@@ -93,9 +101,20 @@ impl Violations {
     }
 
     fn push(&mut self, path: String, kind: ViolationKind, reason: String) -> &mut Violation {
-        let index = self.0.len();
-        self.0.push(Violation { path, kind, reason, suggestion: None });
-        &mut self.0[index]
+        self.found.truncate(MOST);
+        let index = self.found.len();
+        self.found.push(Violation { path, kind, reason, suggestion: None });
+        &mut self.found[index]
+    }
+
+    /// More is wrong than is told; nobody need look further.
+    #[must_use]
+    pub fn is_full(&self) -> bool {
+        self.found.len() > MOST
+    }
+
+    fn told(&self) -> &[Violation] {
+        &self.found[..self.found.len().min(MOST)]
     }
 
     /// A field that must be there is not.
@@ -142,12 +161,12 @@ impl Violations {
     /// Nothing is wrong.
     #[must_use]
     pub fn is_empty(&self) -> bool {
-        self.0.is_empty()
+        self.found.is_empty()
     }
 
     /// The findings.
     pub fn iter(&self) -> std::slice::Iter<'_, Violation> {
-        self.0.iter()
+        self.told().iter()
     }
 
     /// `Ok(value)` when nothing is wrong.
@@ -162,7 +181,7 @@ impl Violations {
     /// The same findings in an object that lies deeper: paths that begin with `from` begin with `to`.
     #[must_use]
     pub fn below(mut self, from: &str, to: &str) -> Self {
-        for violation in &mut self.0 {
+        for violation in &mut self.found {
             if let Some(rest) = violation.path.strip_prefix(from) {
                 violation.path = format!("{to}{rest}");
             }
@@ -170,15 +189,26 @@ impl Violations {
         self
     }
 
+    /// Adds what was found elsewhere, and that it was more than is told.
+    pub fn append(&mut self, more: Violations) {
+        self.found.extend(more.found);
+        self.found.truncate(MOST + 1);
+    }
+
     /// Keeps the findings for which `keep` holds.
     pub fn retain(&mut self, keep: impl FnMut(&Violation) -> bool) {
-        self.0.retain(keep);
+        self.found.retain(keep);
     }
 }
 
 impl Extend<Violation> for Violations {
     fn extend<I: IntoIterator<Item = Violation>>(&mut self, more: I) {
-        self.0.extend(more);
+        for violation in more {
+            if self.is_full() {
+                return;
+            }
+            self.found.push(violation);
+        }
     }
 }
 
@@ -186,15 +216,17 @@ impl IntoIterator for Violations {
     type Item = Violation;
     type IntoIter = std::vec::IntoIter<Violation>;
 
-    fn into_iter(self) -> Self::IntoIter {
-        self.0.into_iter()
+    fn into_iter(mut self) -> Self::IntoIter {
+        self.found.truncate(MOST);
+        self.found.into_iter()
     }
 }
 
 impl fmt::Display for Violations {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let texts: Vec<String> = self.0.iter().map(Violation::to_string).collect();
-        f.write_str(&texts.join("\n"))
+        let texts: Vec<String> = self.iter().map(Violation::to_string).collect();
+        f.write_str(&texts.join("\n"))?;
+        if self.is_full() { write!(f, "\nand more") } else { Ok(()) }
     }
 }
 
@@ -219,9 +251,12 @@ pub fn element_path(path: &str, index: usize) -> String {
     format!("{path}[{index}]")
 }
 
-/// `; did you mean "cpu"?`, when one of `known` is near to `given`.
+/// `; did you mean "cpu"?`, when one of `known` is near to `given`; none for what is longer than any name.
 #[must_use]
 pub fn did_you_mean<'a>(given: &str, known: impl IntoIterator<Item = &'a str>) -> Option<String> {
+    if given.len() > LONGEST {
+        return None;
+    }
     let lower = given.to_ascii_lowercase();
     known
         .into_iter()
@@ -234,6 +269,9 @@ pub fn did_you_mean<'a>(given: &str, known: impl IntoIterator<Item = &'a str>) -
 /// Holds `value` against a JSON schema made by schemars with inlined sub-schemas, and adds what
 /// does not fit. Null means absent, as in Kubernetes.
 pub fn walk_schema(schema: &Value, value: &Value, path: &str, violations: &mut Violations) {
+    if violations.is_full() {
+        return;
+    }
     let schema = without_null(schema);
     if let Some(allowed) = allowed_texts(schema) {
         walk_enum(&allowed, value, path, violations);
@@ -250,6 +288,41 @@ pub fn walk_schema(schema: &Value, value: &Value, path: &str, violations: &mut V
             Some(scalar) => walk_scalar(scalar, schema, value, path, violations),
             None => {}
         }
+    }
+}
+
+/// Adds the fields of `value` that its schema does not have, where it is a schema of Kubernetes' types: they say which fields
+/// there are, and not that there are no others.
+pub fn walk_fields(schema: &Value, value: &Value, path: &str, violations: &mut Violations) {
+    let schema = without_null(schema);
+    let schema = match schema.get("allOf").and_then(Value::as_array).map(Vec::as_slice) {
+        Some([only]) => only,
+        _ => schema,
+    };
+    match value {
+        Value::Array(elements) => {
+            let Some(items) = schema.get("items") else { return };
+            for (i, element) in elements.iter().enumerate() {
+                walk_fields(items, element, &element_path(path, i), violations);
+            }
+        }
+        Value::Object(members) => {
+            let Some(known) = schema.get("properties").and_then(Value::as_object) else { return };
+            for (key, member) in members.iter().filter(|(_, member)| !member.is_null()) {
+                if violations.is_full() {
+                    return;
+                }
+                let path = member_path(path, key);
+                match known.get(key) {
+                    Some(schema) => walk_fields(schema, member, &path, violations),
+                    None => {
+                        violations.not_supported(path, "is not a field").suggestion =
+                            did_you_mean(key, known.keys().map(String::as_str));
+                    }
+                }
+            }
+        }
+        _ => {}
     }
 }
 
@@ -312,6 +385,9 @@ fn walk_object(schema: &Value, value: &Value, path: &str, violations: &mut Viola
     let properties = schema.get("properties").and_then(Value::as_object).unwrap_or(&empty);
     let additional = schema.get("additionalProperties");
     for (key, member) in members.iter().filter(|(_, m)| !m.is_null()) {
+        if violations.is_full() {
+            return;
+        }
         let path = member_path(path, key);
         match (properties.get(key), additional) {
             (Some(schema), _) => walk_schema(schema, member, &path, violations),
@@ -347,6 +423,9 @@ fn walk_array(schema: &Value, value: &Value, path: &str, violations: &mut Violat
     };
     if let Some(items) = schema.get("items") {
         for (i, element) in elements.iter().enumerate() {
+            if violations.is_full() {
+                return;
+            }
             walk_schema(items, element, &element_path(path, i), violations);
         }
     }
@@ -476,71 +555,4 @@ fn scalar_text(value: &Value) -> Result<String, FormatProblem> {
 }
 
 #[cfg(test)]
-mod tests {
-    use schemars::JsonSchema;
-    use serde::Deserialize;
-    use serde_json::json;
-
-    use super::*;
-
-    #[derive(Deserialize, JsonSchema)]
-    #[serde(rename_all = "camelCase", deny_unknown_fields)]
-    #[expect(dead_code, reason = "only its schema is used")]
-    struct Sample {
-        cpu: Option<MilliCpu>,
-        how: Option<How>,
-        tags: Option<Vec<String>>,
-        count: u32,
-        wait: Option<Span>,
-    }
-
-    #[derive(Deserialize, JsonSchema)]
-    enum How {
-        /// One way.
-        Never,
-        /// The other.
-        Always,
-    }
-
-    fn violations(value: &Value) -> Vec<String> {
-        let schema = crate::kind::schema_of::<Sample>();
-        let mut found = Violations::new();
-        walk_schema(&schema, value, "spec", &mut found);
-        found.iter().map(Violation::to_string).collect()
-    }
-
-    #[test]
-    fn a_value_that_fits_has_no_violations() {
-        let full = json!({"cpu": 2, "how": "Never", "tags": ["a"], "count": 1, "wait": "3s"});
-        assert_eq!(violations(&full), Vec::<String>::new());
-        assert_eq!(violations(&json!({"count": 1, "cpu": null})), Vec::<String>::new());
-    }
-
-    #[test]
-    fn every_violation_is_found_at_once() {
-        let bad = json!({"cpu": "2core", "how": "never", "tags": [1], "cout": 3, "wait": 30});
-        assert_eq!(
-            violations(&bad),
-            [
-                "spec.cout: is not a field; did you mean \"count\"?",
-                "spec.cpu: \"2core\" is not a quantity of cpu; try \"2\" or \"2000m\"",
-                "spec.how: \"never\" is none of \"Never\", \"Always\"; did you mean \"Never\"?",
-                "spec.tags[0]: is 1 where a text is expected; put it in quotes: \"1\"",
-                "spec.wait: \"30\" is not a duration; try \"30s\"",
-                "spec.count: is required",
-            ]
-        );
-    }
-
-    #[test]
-    fn numbers_keep_to_their_range() {
-        assert_eq!(
-            violations(&json!({"count": -1})),
-            ["spec.count: -1 is less than the smallest allowed, 0"]
-        );
-        assert_eq!(
-            violations(&json!({"count": 1.5})),
-            ["spec.count: is 1.5 where a whole number is expected"]
-        );
-    }
-}
+mod tests;

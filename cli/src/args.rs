@@ -9,8 +9,8 @@ use muster_api::selector::{FieldSelector, LabelSelector, SelectorError};
 
 use crate::client::Selection;
 use crate::command::{
-    apply, cordon, create, delete, describe, drain, estop, get, local, logs, node, offers, plan,
-    rollout, scale, token, top, version, wait, why,
+    apply, cordon, create, delete, describe, drain, estop, exec, get, local, logs, node, offers,
+    plan, rollout, scale, token, top, version, wait, why,
 };
 use crate::output::ui::Color;
 
@@ -79,6 +79,8 @@ pub(crate) enum Command {
     Rollout(rollout::Command),
     /// Print what a task wrote
     Logs(logs::Args),
+    /// Run a program in a running task, held to its limits; the program's exit code is the command's
+    Exec(exec::Args),
     /// Show what nodes or tasks use, measured by the kernel
     Top(top::Args),
     /// Wait until objects are as said

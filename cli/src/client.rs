@@ -27,6 +27,10 @@ pub(crate) struct Client {
     pub(crate) origin: String,
 }
 
+/// Messages in both directions.
+pub(crate) type Socket =
+    tokio_tungstenite::WebSocketStream<hyper_util::rt::TokioIo<hyper::upgrade::Upgraded>>;
+
 /// Which objects of a collection are meant.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub(crate) struct Selection {
@@ -266,6 +270,18 @@ impl Client {
     pub(crate) async fn stream(&self, uri: &str) -> Result<Stream, CliError> {
         let response = self.send(Method::GET, uri, None).await?;
         Ok(Stream { client: self.clone(), body: response.into_body(), rest: Vec::new() })
+    }
+
+    /// GET that becomes a WebSocket, of the subprotocol `v5.channel.k8s.io`.
+    pub(crate) async fn connect(&self, uri: &str) -> Result<Socket, CliError> {
+        let request = Request::get(uri)
+            .body(Vec::new())
+            .map_err(|error| CliError::usage(format!("{uri:?} is not a path: {error}")))?;
+        match self.http.connect(request).await {
+            Ok(connection) => Ok(connection.into_stream()),
+            Err(kube::Error::Api(status)) => Err(self.refused(*status)),
+            Err(error) => Err(self.unreachable(error)),
+        }
     }
 
     async fn call<T: DeserializeOwned>(

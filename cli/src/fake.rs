@@ -36,10 +36,13 @@ struct Inner {
     refused: Vec<(String, String, String)>,
     /// The same, once nobody rehearses any more.
     refused_late: Vec<(String, String, String)>,
+    /// So many transactions come too late.
+    moves: u32,
     answers: BTreeMap<String, String>,
     requests: Vec<String>,
     last_body: Value,
     on_create: Option<Edit>,
+    meanwhile: Option<Edit>,
 }
 
 /// The fake. Clones are the same one.
@@ -196,6 +199,11 @@ impl Fake {
         self.lock().refused_late.push((name.to_owned(), field.to_owned(), message.to_owned()));
     }
 
+    /// The next transactions find that the cluster has moved on.
+    pub(crate) fn move_on(&self, times: u32) {
+        self.lock().moves = times;
+    }
+
     /// Answers `METHOD PATH`.
     pub(crate) fn answer(&self, request: &str, answer: Value) {
         self.answer_text(request, &answer.to_string());
@@ -208,6 +216,11 @@ impl Fake {
     /// Changes objects as they are created.
     pub(crate) fn on_create(&self, edit: impl Fn(&mut Value) + Send + 'static) {
         self.lock().on_create = Some(Box::new(edit));
+    }
+
+    /// Somebody else changes the object just before the next patch of it.
+    pub(crate) fn meanwhile(&self, edit: impl Fn(&mut Value) + Send + 'static) {
+        self.lock().meanwhile = Some(Box::new(edit));
     }
 
     pub(crate) fn object(&self, key: &str) -> Option<Value> {
@@ -306,6 +319,9 @@ async fn handle(State(fake): State<Fake>, method: Method, uri: Uri, body: Bytes)
         let code = StatusCode::METHOD_NOT_ALLOWED;
         return failure(code, "MethodNotAllowed", &message, Value::Null);
     }
+    if path.plural == "transaction" {
+        return transaction(&fake, &body);
+    }
     let dry = parameters.contains_key("dryRun");
     match (method, path.name.clone()) {
         (Method::GET, None) if parameters.contains_key("watch") => follow(fake, path, parameters),
@@ -332,6 +348,54 @@ async fn handle(State(fake): State<Fake>, method: Method, uri: Uri, body: Bytes)
         }
         _ => failure(StatusCode::METHOD_NOT_ALLOWED, "MethodNotAllowed", "no", Value::Null),
     }
+}
+
+fn transaction(fake: &Fake, body: &Value) -> Response {
+    if fake.lock().moves > 0 {
+        fake.lock().moves -= 1;
+        return failure(StatusCode::CONFLICT, "Conflict", "the cluster has moved on", Value::Null);
+    }
+    let requests = body["requests"].as_array().cloned().unwrap_or_default();
+    let of = |request: &Value| {
+        let created = &request["create"];
+        let named =
+            ["patch", "check"].iter().map(|way| &request[*way]["of"]).find(|of| of.is_object());
+        let named = named.unwrap_or_else(|| &created["metadata"]);
+        let kind = named["kind"].as_str().or_else(|| created["kind"].as_str()).unwrap_or_default();
+        let info = muster_api::kind::find_by_word(kind).expect("a kind");
+        let text = |field: &str| named[field].as_str().map(str::to_owned);
+        let namespace = text("namespace").filter(|_| info.namespaced);
+        let path = Path { plural: info.plural.to_owned(), namespace, name: None };
+        (path.key(&text("name").unwrap_or_default()), path, text("name").unwrap_or_default())
+    };
+    for (index, request) in requests.iter().enumerate() {
+        let (_, _, name) = of(request);
+        if refusal(fake, &name, false).is_some() {
+            let inner = fake.lock();
+            let all = inner.refused.iter().chain(&inner.refused_late);
+            let (_, field, message) = all.clone().find(|(n, _, _)| *n == name).expect("refused");
+            let status = json!({
+                "kind": "Status", "status": "Failure", "reason": "Invalid", "code": 422, "message": "is invalid",
+                "details": {"causes": [{"field": field, "message": message}]},
+            });
+            let refusals = json!({"refusals": [{"index": index, "status": status}]});
+            return refusals.to_string().into_response();
+        }
+    }
+    let objects: Vec<Value> = requests
+        .iter()
+        .map(|request| {
+            let (key, path, _) = of(request);
+            if request["create"].is_object() {
+                drop(create(fake, &path, request["create"].clone(), false));
+            } else if request["patch"].is_object() {
+                let present = fake.object(&key).expect("it is there");
+                drop(patch(fake, &key, present, &request["patch"]["patch"], false));
+            }
+            fake.object(&key).unwrap_or_default()
+        })
+        .collect();
+    json!({ "objects": objects }).to_string().into_response()
 }
 
 fn refusal(fake: &Fake, name: &str, dry: bool) -> Option<Response> {
@@ -374,6 +438,17 @@ fn patch(fake: &Fake, key: &str, mut object: Value, patch: &Value, dry: bool) ->
     let name = object["metadata"]["name"].as_str().unwrap_or_default().to_owned();
     if let Some(refused) = refusal(fake, &name, dry) {
         return refused;
+    }
+    let meanwhile = fake.lock().meanwhile.take();
+    if let Some(edit) = meanwhile {
+        edit(&mut object);
+        fake.put(key, object);
+        object = fake.object(key).unwrap_or_default();
+    }
+    let known = patch.pointer("/metadata/resourceVersion").filter(|known| !known.is_null());
+    if known.is_some_and(|known| *known != object["metadata"]["resourceVersion"]) {
+        let message = format!("{name} has changed");
+        return failure(StatusCode::CONFLICT, "Conflict", &message, Value::Null);
     }
     json_patch::merge(&mut object, patch);
     if !dry {

@@ -4,7 +4,7 @@
 //! |---|---|
 //! | [`args`], [`target`] | the command line; which objects its words name |
 //! | [`config`], [`client`], [`watch`], [`successor`] | kubeconfig; REST; following a collection, and a task over its uids |
-//! | [`manifests`], [`merge`] | files → checked objects; three-way merge |
+//! | [`manifests`], [`sites`], [`merge`] | files → checked objects, maps too; three-way merge |
 //! | [`command`] | one file a verb |
 //! | [`output`] | tables, sheets, progress |
 //! | [`error`], [`exit`] | classes of errors, their hints and exit codes |
@@ -22,6 +22,7 @@ mod manifests;
 mod merge;
 mod output;
 mod session;
+mod sites;
 mod successor;
 mod target;
 mod watch;
@@ -35,10 +36,11 @@ use crate::output::ui::Ui;
 
 fn main() -> ExitCode {
     let mut args = std::env::args_os();
-    // Before anything else: shim and gate must stay small, and they have no use for the rest.
+    // Before anything else: shim, gate and simulator must stay small, and they have no use for the rest.
     match args.nth(1) {
         Some(verb) if verb == muster_agent::shim::VERB => muster_agent::shim::main(args),
         Some(verb) if verb == muster_agent::gate::VERB => muster_agent::gate::main(args),
+        Some(verb) if verb == muster_agent::sim::VERB => muster_agent::sim::main(args),
         _ => {}
     }
     // Before anything makes a TLS configuration. An error means that there is a provider already.

@@ -13,6 +13,7 @@ use muster_api::validate::{Violation, Violations, element_path};
 use serde_json::Value;
 
 use crate::error::{CliError, Refusal};
+use crate::sites;
 
 /// What `-f -` is called in messages.
 const STDIN: &str = "<stdin>";
@@ -208,11 +209,13 @@ fn check(mut part: Part, namespace: &str, given: bool) -> Result<Manifest, Vec<D
     if let Some(metadata) = part.object.get_mut("metadata").and_then(Value::as_object_mut) {
         metadata.retain(|key, _| !OWNED.contains(&key.as_str()));
     }
+    let maps = sites::read_map(&mut part.object, &part.document.source);
     let diagnose = |violations: Violations| -> Vec<Diagnostic> {
         let mut all: Vec<Diagnostic> = violations.into_iter().map(|v| part.at(v)).collect();
         all.sort_by_key(|d| d.location);
         all
     };
+    maps.map_err(diagnose)?;
     let mut admitted = kind::admit(&part.object).map_err(diagnose)?;
     let mut violations = Violations::new();
     let text =

@@ -6,37 +6,45 @@
 //!        → writer (commits what is queued) → lock
 //! ```
 
+use std::any::Any;
 use std::collections::BTreeSet;
 use std::fs::{File, TryLockError};
 use std::io;
 use std::net::SocketAddr;
+use std::panic::AssertUnwindSafe;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
 use axum::Router;
+use axum::response::{IntoResponse as _, Response};
+use futures::FutureExt as _;
 use tokio::net::TcpListener;
 use tokio::sync::mpsc;
 use tokio::task::{JoinError, JoinHandle};
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
+use tower_http::catch_panic::CatchPanicLayer;
 
 use crate::config::Config;
 use crate::context::{Clock as _, Context, Live, SystemClock};
 use crate::events::{self, Happening, Recorder};
 use crate::kubeconfig::KubeconfigError;
 use crate::pki::{Pki, PkiError};
+use crate::rest::failure::Failure;
 use crate::serve::Server;
 use crate::session::agents::Agents;
+use crate::session::execs::{self, Execs};
 use crate::session::frameworks::proto::framework_service_server::FrameworkServiceServer;
 use crate::session::frameworks::service::Service;
 use crate::session::frameworks::{Frameworks, MAX_WIRE, lines};
 use crate::session::logs::SessionLogs;
 use crate::session::poses::proto::pose_service_server::PoseServiceServer;
 use crate::session::poses::{self, LivePoses};
+use crate::session::proto::exec_service_server::ExecServiceServer;
 use crate::session::{self, Sessions};
 use crate::store::{self, OpenError, StoreError};
-use crate::{kubeconfig, metrics, reconcile, rest};
+use crate::{footprint, kubeconfig, metrics, reconcile, rest};
 
 /// How long requests in flight may take to finish after a signal.
 const DEADLINE: Duration = Duration::from_secs(5);
@@ -83,6 +91,9 @@ pub enum AppError {
     /// The metrics recorder.
     #[error("cannot install the metrics recorder")]
     Metrics(#[from] metrics_exporter_prometheus::BuildError),
+    /// A part of it ended by a panic, which the log tells; without it the rest would only seem to work.
+    #[error("a part of the controller has failed; it has to be started again")]
+    Broken,
     /// A task ended by a panic.
     #[error("a task of the controller failed")]
     Task(#[source] JoinError),
@@ -110,12 +121,12 @@ pub async fn run(
     config: Config,
     shutdown: impl Future<Output = ()> + Send,
 ) -> Result<(), AppError> {
+    footprint::give_buffers_back();
+    footprint::take_descriptors();
     let running = start(config).await?;
     let address = running.address();
     tracing::info!(%address, url = running.context.url(), "serving");
-    shutdown.await;
-    tracing::info!("shutting down");
-    running.shut_down().await
+    running.until(shutdown).await
 }
 
 /// Starts a controller; it answers when this returns.
@@ -139,36 +150,41 @@ pub async fn start(config: Config) -> Result<Running, AppError> {
     let (events, happenings) = Recorder::new();
     let context = Arc::new(Context::new(store, pki, config, address, metrics, events));
     let stop_writer = CancellationToken::new();
-    let writer = tokio::spawn(writer.run(stop_writer.clone()));
+    let writer = writer.run(stop_writer.clone());
+    let writer = tokio::spawn(guard(Arc::clone(&context), "writer", writer));
     rest::namespace::bootstrap(&context).await.map_err(AppError::Bootstrap)?;
     let admin = context.pki.admin(now)?;
     let (file, asked) = (&context.config.kubeconfig, context.config.kubeconfig_asked);
     kubeconfig::write(file, asked, &context.url(), context.pki.ca(), &admin)?;
 
     let background = TaskTracker::new();
-    let services = spawn_background(&context, &background, happenings);
+    let services = work(&context, &background, happenings);
     let server = Server {
         tls,
         router: router(&context, services),
         stop: context.stop.clone(),
         kill: CancellationToken::new(),
         connections: TaskTracker::new(),
+        limits: Arc::default(),
     };
     let (kill, connections) = (server.kill.clone(), server.connections.clone());
     let accept = tokio::spawn(server.accept(listener));
     Ok(Running { context, kill, connections, background, accept, writer, stop_writer, _lock: lock })
 }
 
-/// Everything that works beside the requests. Each ends when `context.stop` is cancelled.
-fn spawn_background(
+/// Begins everything that works beside the requests: all of a controller but its port. Each part ends when `context.stop`
+/// is cancelled; what agents and those who publish poses dial is given back. Once for a context.
+pub fn work(
     context: &Arc<Context>,
     background: &TaskTracker,
     happenings: mpsc::Receiver<Happening>,
 ) -> (Agents, poses::Service) {
     background.spawn(metrics::upkeep(context.metrics.clone(), context.stop.clone()));
-    background.spawn(rest::namespace::finalize(Arc::clone(context)));
+    let finalize = rest::namespace::finalize(Arc::clone(context));
+    background.spawn(guard(Arc::clone(context), "namespaces", finalize));
     let record = events::run(Arc::clone(context), happenings);
-    background.spawn(context.stop.clone().run_until_cancelled_owned(record));
+    let record = context.stop.clone().run_until_cancelled_owned(record);
+    background.spawn(guard(Arc::clone(context), "events", record));
     let sessions = Arc::new(Sessions::default());
     let poses = Arc::new(LivePoses::default());
     let reconcilers = reconcile::spawn(context, &sessions, &poses, background);
@@ -186,12 +202,33 @@ fn spawn_background(
     context.set_live(Live {
         scheduler: reconcilers.scheduler,
         sessions: Arc::clone(&sessions),
+        execs: Arc::new(Execs::new(Arc::clone(&sessions), background.clone())),
         frameworks,
         poses: Arc::clone(&poses),
     });
     let publishers =
         poses::Service::new(Arc::clone(&poses), background.clone(), context.stop.clone());
     (Agents::new(Arc::clone(context), sessions, poses, background.clone()), publishers)
+}
+
+/// Work without which the controller is none. Should it panic, the process is to end: a loop that is silently gone would be
+/// missed only when what it does is missing.
+pub(crate) async fn guard<T>(
+    context: Arc<Context>,
+    name: &'static str,
+    work: impl Future<Output = T>,
+) {
+    if AssertUnwindSafe(work).catch_unwind().await.is_err() {
+        tracing::error!(name, "a part of the controller has panicked; the process ends");
+        context.broken.cancel();
+    }
+}
+
+/// What a client is told whose request met a fault of ours; the panic is in the log.
+fn fault(_: Box<dyn Any + Send>) -> Response {
+    ::metrics::counter!("muster_request_panics_total").increment(1);
+    Failure::internal("the request met a fault of the controller; its log tells more")
+        .into_response()
 }
 
 /// REST and gRPC as one router.
@@ -206,6 +243,10 @@ fn router(context: &Arc<Context>, (agents, publishers): (Agents, poses::Service)
             .route_service("/muster.framework.v1.FrameworkService/{*method}", service)
             .merge(lines::router(frameworks))
     });
+    let execs = context.live().map(|live| Arc::clone(&live.execs)).map(|execs| {
+        let service = ExecServiceServer::new(execs::Service(execs));
+        Router::new().route_service("/muster.agent.v1.ExecService/{*method}", service)
+    });
     Router::new()
         .route_service(
             "/muster.agent.v1.AgentService/{*method}",
@@ -217,7 +258,9 @@ fn router(context: &Arc<Context>, (agents, publishers): (Agents, poses::Service)
             PoseServiceServer::new(publishers).max_decoding_message_size(MAX_WIRE),
         )
         .merge(frameworks.unwrap_or_default())
+        .merge(execs.unwrap_or_default())
         .merge(rest::router(Arc::clone(context)))
+        .layer(CatchPanicLayer::custom(fault))
 }
 
 impl Running {
@@ -233,10 +276,20 @@ impl Running {
         &self.context
     }
 
+    /// Works until `shutdown` is ready, or until a part of it has failed for good, and ends it.
+    async fn until(self, shutdown: impl Future<Output = ()> + Send) -> Result<(), AppError> {
+        let broken = self.context.broken.clone();
+        tokio::select! {
+            () = shutdown => tracing::info!("shutting down"),
+            () = broken.cancelled() => {}
+        }
+        self.shut_down().await
+    }
+
     /// Ends it: requests in flight are finished, at most for a few seconds, and what was acknowledged is durable.
     ///
     /// # Errors
-    /// When one of its tasks had panicked.
+    /// When a part of it had failed.
     pub async fn shut_down(self) -> Result<(), AppError> {
         self.context.stop.cancel();
         self.accept.await.map_err(AppError::Task)?;
@@ -246,10 +299,12 @@ impl Running {
             self.kill.cancel();
             self.connections.wait().await;
         }
+        self.context.streams.ended().await;
         self.background.close();
         self.background.wait().await;
         self.stop_writer.cancel();
-        self.writer.await.map_err(AppError::Task)
+        self.writer.await.map_err(AppError::Task)?;
+        if self.context.broken.is_cancelled() { Err(AppError::Broken) } else { Ok(()) }
     }
 }
 
@@ -309,4 +364,46 @@ pub fn chain(error: &dyn std::error::Error) -> String {
         next = cause.source();
     }
     text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn config(dir: &Path) -> Config {
+        Config {
+            data_dir: dir.join("data"),
+            listen: SocketAddr::from(([127, 0, 0, 1], 0)),
+            kubeconfig: dir.join("kubeconfig"),
+            kubeconfig_asked: true,
+            advertise: Vec::new(),
+            encryption_key: None,
+        }
+    }
+
+    #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+    async fn a_part_that_panics_ends_the_process() {
+        let dir = tempfile::tempdir().unwrap();
+        let running = start(config(dir.path())).await.unwrap();
+        let loops = guard(Arc::clone(&running.context), "test", async { panic!("a fault") });
+        running.background.spawn(loops);
+        let ended = running.until(std::future::pending()).await;
+        assert!(matches!(ended, Err(AppError::Broken)), "{ended:?}");
+    }
+
+    #[tokio::test]
+    async fn a_request_that_panics_is_a_status() {
+        use tower::ServiceExt as _;
+        let faulty = axum::routing::get(async || -> Response { panic!("a fault") });
+        let router = Router::new().route("/", faulty).layer(CatchPanicLayer::custom(fault));
+        let request = http::Request::get("/").body(axum::body::Body::empty()).unwrap();
+        let response = router.oneshot(request).await.unwrap();
+        assert_eq!(response.status(), 500);
+        let body = axum::body::to_bytes(response.into_body(), 1 << 20).await.unwrap();
+        let status: serde_json::Value = serde_json::from_slice(&body).unwrap();
+        assert_eq!(
+            (&status["kind"], &status["reason"]),
+            (&"Status".into(), &"InternalError".into())
+        );
+    }
 }

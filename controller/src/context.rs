@@ -14,10 +14,16 @@ use crate::pki::Pki;
 use crate::quota::Door;
 use crate::reconcile::schedule;
 use crate::rest::log::LogSource;
+use crate::rest::{Bodies, Rendered, Streams};
 use crate::session::Sessions;
+use crate::session::execs::Execs;
 use crate::session::frameworks::Frameworks;
 use crate::session::poses::LivePoses;
 use crate::store::Store;
+
+/// Requests that are worked on at once. A client that finds all places taken is told to come back: a queue would only make
+/// everybody late. One core answers thousands in a second.
+const AT_ONCE: usize = 512;
 
 /// Where "now" comes from; tests hold it still.
 pub trait Clock: fmt::Debug + Send + Sync {
@@ -52,6 +58,16 @@ pub struct Context {
     pub stop: CancellationToken,
     /// Takes what people should see under an object.
     pub events: Recorder,
+    /// A place for each request that is worked on at once, without those that last (watches, logs).
+    pub places: tokio::sync::Semaphore,
+    /// Room for what clients send.
+    pub bodies: Bodies,
+    /// Answers that last: watches, logs, long lists.
+    pub streams: Streams,
+    /// Changes as they were last shown to watchers.
+    pub rendered: Rendered,
+    /// Cancelled when a part of the controller has failed for good: the process is to end, and to be started again.
+    pub(crate) broken: CancellationToken,
     /// Held while a task is given to a node (shared) and while a Node is deleted (alone): a Node is found unused and is
     /// gone before the next task is given to it, or the other way round.
     pub(crate) placing: tokio::sync::RwLock<()>,
@@ -69,6 +85,8 @@ pub struct Live {
     pub scheduler: schedule::Handle,
     /// Who is connected, and what is used.
     pub sessions: Arc<Sessions>,
+    /// Programs that clients run in tasks.
+    pub(crate) execs: Arc<Execs>,
     /// Who takes offers.
     pub frameworks: Arc<Frameworks>,
     /// Where robots are.
@@ -76,7 +94,9 @@ pub struct Live {
 }
 
 impl Context {
-    pub(crate) fn new(
+    /// A context that nothing works on yet: see [`crate::app::work`].
+    #[must_use]
+    pub fn new(
         store: Store,
         pki: Pki,
         config: Config,
@@ -92,12 +112,23 @@ impl Context {
             address,
             stop: CancellationToken::new(),
             events,
+            places: tokio::sync::Semaphore::new(AT_ONCE),
+            bodies: Bodies::default(),
+            streams: Streams::default(),
+            rendered: Rendered::default(),
+            broken: CancellationToken::new(),
             placing: tokio::sync::RwLock::new(()),
             door: Arc::default(),
             metrics,
             logs: OnceLock::new(),
             live: OnceLock::new(),
         }
+    }
+
+    /// The same with another clock.
+    #[must_use]
+    pub fn with_clock(self, clock: Arc<dyn Clock>) -> Self {
+        Self { clock, ..self }
     }
 
     /// The present time, whole seconds as in `metadata.creationTimestamp`.
@@ -124,11 +155,30 @@ impl Context {
         drop(self.live.set(live));
     }
 
-    pub(crate) fn live(&self) -> Option<&Live> {
+    /// What is known of the live cluster; none: nothing works on the context yet.
+    #[must_use]
+    pub fn live(&self) -> Option<&Live> {
         self.live.get()
     }
 
     pub(crate) fn log_source(&self) -> Option<&Arc<dyn LogSource>> {
         self.logs.get()
     }
+}
+
+/// A context over `store` with its files in `dir`; nothing works on it.
+#[cfg(test)]
+pub(crate) fn for_tests(dir: &std::path::Path, store: Store) -> Arc<Context> {
+    let pki = Pki::open(dir, SystemClock.now()).expect("a certificate authority");
+    let config = Config {
+        data_dir: dir.to_owned(),
+        listen: "127.0.0.1:0".parse().expect("an address"),
+        kubeconfig: dir.join("kubeconfig"),
+        kubeconfig_asked: true,
+        advertise: Vec::new(),
+        encryption_key: None,
+    };
+    let (address, (events, _)) = (config.listen, Recorder::new());
+    let metrics = crate::metrics::recorder().expect("the process's recorder");
+    Arc::new(Context::new(store, pki, config, address, metrics, events))
 }

@@ -104,7 +104,9 @@ fn is_over(task: &Value) -> bool {
 /// Refuses a new task that would wait for itself.
 ///
 /// Two that are created in the same moment can still close a ring; both wait then, and each says for which.
-pub(crate) fn check(store: &Store, object: &Value) -> Result<(), Violations> {
+///
+/// `planned`: objects that are stored in the same moment.
+pub(crate) fn check(store: &Store, planned: &[Value], object: &Value) -> Result<(), Violations> {
     let first = depend::named(object);
     let metadata = &object["metadata"];
     let (Some(name), Some(namespace)) = (metadata["name"].as_str(), metadata["namespace"].as_str())
@@ -121,7 +123,8 @@ pub(crate) fn check(store: &Store, object: &Value) -> Result<(), Violations> {
         }
         let stored = store.get(&key_of(namespace, &next)).filter(|s| s.mentions("dependsOn"));
         // What has ended waits for nobody.
-        let value = stored.map(|stored| stored.value()).filter(|task| !is_over(task));
+        let stored = stored.map(|stored| stored.value()).filter(|task| !is_over(task));
+        let value = stored.or_else(|| objects::among(planned, "Task", (namespace, &next)).cloned());
         let more = value.as_ref().map(depend::named).unwrap_or_default();
         left.extend(more.iter().cloned());
         graph.insert(next, more);

@@ -124,7 +124,12 @@ pub async fn run(context: Arc<Context>, mut happenings: mpsc::Receiver<Happening
     }
 }
 
-async fn write(context: &Context, happening: Happening) -> Result<(), StoreError> {
+async fn write(context: &Context, mut happening: Happening) -> Result<(), StoreError> {
+    if let Some(name) = happening.about.name.as_deref().filter(|_| happening.about.uid.is_none()) {
+        // A node, which is told of by its name; those who describe it look for its uid.
+        let node = context.store.get(&objects::node_key(name));
+        happening.about.uid = node.map(|node| node.uid.to_string());
+    }
     let now = context.clock.now();
     let namespace = happening.about.namespace.clone().unwrap_or_else(|| DEFAULT.to_owned());
     let suffix = uuid::Uuid::new_v4().simple().to_string();

@@ -14,7 +14,7 @@
 //! | [`events`], [`objects`] | Event objects; typed reading and writing of the kinds |
 //! | `quota` | the door of namespaces with a Quota |
 //! | `serve` | the TLS port |
-//! | `kubeconfig`, `metrics` | the admin's credential file; the Prometheus recorder |
+//! | `kubeconfig`, `metrics`, `footprint` | the admin's credential file; the Prometheus recorder; freed memory and descriptors |
 
 pub mod app;
 pub mod auth;
@@ -23,6 +23,7 @@ pub mod configs;
 pub mod context;
 mod depends;
 pub mod events;
+mod footprint;
 pub mod kubeconfig;
 mod metrics;
 pub mod objects;

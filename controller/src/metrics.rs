@@ -39,7 +39,19 @@ fn describe() {
         metrics::Unit::Seconds,
         "Time to answer a REST request, watches and logs left out"
     );
+    metrics::describe_counter!(
+        "muster_request_panics_total",
+        "Requests that met a fault of the controller"
+    );
+    metrics::describe_counter!(
+        "muster_stalled_readers_total",
+        "Watches, logs and lists that were cut off because their readers took nothing"
+    );
     metrics::describe_gauge!("muster_connections", "Open TLS connections");
+    metrics::describe_counter!(
+        "muster_decisions_total",
+        "Looks at all waiting tasks; each decides for every one of them"
+    );
     metrics::describe_counter!(
         "muster_framework_messages_total",
         "Messages between frameworks and executors that passed the controller, by direction"

@@ -29,6 +29,8 @@ pub const APPLICATIONS: Resource = Resource::new("applications");
 pub const FRAMEWORKS: Resource = Resource::new("frameworks");
 /// Quotas.
 pub const QUOTAS: Resource = Resource::new("quotas");
+/// Sites.
+pub const SITES: Resource = Resource::new("sites");
 /// Leases.
 pub const LEASES: Resource = Resource::new("leases");
 /// Events.
@@ -101,6 +103,7 @@ pub fn is_race(error: &StoreError) -> bool {
         StoreError::AlreadyExists { .. }
         | StoreError::NotFound { .. }
         | StoreError::Conflict { .. }
+        | StoreError::Moved { .. }
         | StoreError::UidMismatch { .. } => true,
         StoreError::Malformed { .. } | StoreError::Closed | StoreError::Storage { .. } => false,
     }

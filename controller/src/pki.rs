@@ -92,7 +92,10 @@ impl std::fmt::Debug for Pki {
 
 impl Pki {
     /// Opens the authority in `dir`, or makes it.
-    pub(crate) fn open(dir: &Path, now: Timestamp) -> Result<Self, PkiError> {
+    ///
+    /// # Errors
+    /// When a file cannot be read or written, or holds something else.
+    pub fn open(dir: &Path, now: Timestamp) -> Result<Self, PkiError> {
         let failed = |source| PkiError::File { path: dir.to_owned(), source };
         fs::DirBuilder::new().recursive(true).mode(0o700).create(dir).map_err(failed)?;
         let pair = match read_pair(dir, "ca")? {

@@ -97,8 +97,7 @@ impl Master {
         kind: &str,
         api: &Uri,
     ) -> Result<Vec<String>, MasterError> {
-        let params = [topic.into(), kind.into(), api.to_string().into()];
-        self.call("registerPublisher", params, list).await
+        self.register("registerPublisher", [topic, kind], api).await
     }
 
     /// Takes a publisher back; whether it was registered.
@@ -107,9 +106,7 @@ impl Master {
     ///
     /// The master does not answer.
     pub async fn unregister_publisher(&self, topic: &str, api: &Uri) -> Result<bool, MasterError> {
-        self.call("unregisterPublisher", [topic.into(), api.to_string().into()], number)
-            .await
-            .map(|n| n > 0)
+        self.unregister("unregisterPublisher", topic, api).await
     }
 
     /// Registers a subscriber; the publishers' addresses. `*` is a type that takes any.
@@ -123,8 +120,7 @@ impl Master {
         kind: &str,
         api: &Uri,
     ) -> Result<Vec<String>, MasterError> {
-        let params = [topic.into(), kind.into(), api.to_string().into()];
-        self.call("registerSubscriber", params, list).await
+        self.register("registerSubscriber", [topic, kind], api).await
     }
 
     /// Takes a subscriber back; whether it was registered.
@@ -133,9 +129,27 @@ impl Master {
     ///
     /// The master does not answer.
     pub async fn unregister_subscriber(&self, topic: &str, api: &Uri) -> Result<bool, MasterError> {
-        self.call("unregisterSubscriber", [topic.into(), api.to_string().into()], number)
-            .await
-            .map(|n| n > 0)
+        self.unregister("unregisterSubscriber", topic, api).await
+    }
+
+    async fn register(
+        &self,
+        method: &'static str,
+        [topic, kind]: [&str; 2],
+        api: &Uri,
+    ) -> Result<Vec<String>, MasterError> {
+        let params = [topic.into(), kind.into(), api.to_string().into()];
+        self.call(method, params, list).await
+    }
+
+    async fn unregister(
+        &self,
+        method: &'static str,
+        topic: &str,
+        api: &Uri,
+    ) -> Result<bool, MasterError> {
+        let taken = self.call(method, [topic.into(), api.to_string().into()], number).await?;
+        Ok(taken > 0)
     }
 
     /// The address of a node.

@@ -4,6 +4,7 @@ import threading
 import time
 
 from kubernetes import client, config, dynamic, watch
+from kubernetes.stream import stream
 
 DEADLINE = 60
 GROUP, VERSION = "muster.dev", "v1alpha1"
@@ -66,6 +67,39 @@ def core():
     until("a log", lambda: v1.read_namespaced_pod_log("dynamic", "default") == "from python\n")
 
 
+def programs():
+    """Programs in a task: what they write, how they end, and a mebibyte through one and back."""
+    v1 = client.CoreV1Api()
+
+    def run(*command, **how):
+        how = {"stdin": False, "stdout": True, "stderr": True, "tty": False, **how}
+        return stream(v1.connect_get_namespaced_pod_exec, "dynamic", "default", command=list(command), **how)
+
+    assert run("sh", "-c", "echo out; echo err >&2") in ("out\nerr\n", "err\nout\n")
+    ended = run("sh", "-c", "echo some; exit 7", _preload_content=False)
+    ended.run_forever(timeout=DEADLINE)
+    assert (ended.read_stdout(), ended.returncode) == ("some\n", 7), ended.returncode
+
+    sent = "".join(f"{n:07}\n" for n in range(1 << 17))
+    cat = run("cat", stdin=True, _preload_content=False)
+    came, at, end = "", 0, time.monotonic() + DEADLINE
+    while len(came) < len(sent):
+        if at < len(sent):
+            cat.write_stdin(sent[at:at + 32768])
+            at += 32768
+        cat.update(timeout=0 if at < len(sent) else 1)
+        if cat.peek_stdout():
+            came += cat.read_stdout()
+        assert time.monotonic() < end, len(came)
+    assert came == sent
+    cat.close()
+    try:
+        stream(v1.connect_get_namespaced_pod_exec, "none", "default", command=["true"], stdout=True)
+        raise SystemExit("there is no such pod")
+    except client.ApiException as error:
+        assert "not found" in str(error), error
+
+
 def watch_goes_on():
     """A watch that ends is taken up where it was: nothing is missed, nothing comes twice."""
     v1 = client.CoreV1Api()
@@ -97,6 +131,6 @@ def watch_goes_on():
 
 
 config.load_kube_config()
-for what in (custom_objects, dynamic_client, core, watch_goes_on):
+for what in (custom_objects, dynamic_client, core, programs, watch_goes_on):
     what()
     print(what.__name__, flush=True)

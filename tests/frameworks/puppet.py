@@ -142,13 +142,14 @@ def obey(puppet, driver, order):
 def main():
     info = json.loads(sys.argv[1])
     position = info.get("position")
+    cost = muster.Cost[info.get("cost", "DISTANCE")]
     puppet = Puppet()
     driver = muster.SchedulerDriver(
         puppet,
         muster.FrameworkInfo(
             name=info["name"],
             namespace=info.get("namespace", "default"),
-            position=muster.Position(x=position[0], y=position[1]) if position else None,
+            position=muster.Position(x=position[0], y=position[1], cost=cost) if position else None,
             radius=info.get("radius"),
             failover_timeout=info.get("failover_timeout"),
             framework_id=info.get("id", ""),

@@ -215,12 +215,26 @@ impl Cluster {
         child.wait().expect("it is ours");
     }
 
+    /// Waits for the end of a controller that was told to end.
+    pub fn await_controller(&mut self) {
+        let mut child = self.controller.take().expect("the controller runs");
+        child.wait().expect("it is ours");
+    }
+
     async fn try_client(&self) -> Result<Client, String> {
+        Client::try_from(self.try_config().await?).map_err(|e| e.to_string())
+    }
+
+    async fn try_config(&self) -> Result<Config, String> {
         let kubeconfig = Kubeconfig::read_from(self.kubeconfig()).map_err(|e| e.to_string())?;
-        let config = Config::from_custom_kubeconfig(kubeconfig, &KubeConfigOptions::default())
-            .await
-            .map_err(|e| e.to_string())?;
-        Client::try_from(config).map_err(|e| e.to_string())
+        let options = KubeConfigOptions::default();
+        let config = Config::from_custom_kubeconfig(kubeconfig, &options).await;
+        config.map_err(|e| e.to_string())
+    }
+
+    /// What a client of the admin's is made of, for one on another runtime.
+    pub async fn client_config(&self) -> Config {
+        self.try_config().await.expect("the kubeconfig is good")
     }
 
     /// A client with the admin's credential.

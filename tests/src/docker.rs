@@ -28,6 +28,19 @@ pub fn image() {
         "no Docker Engine answers (tests/run starts one): {}",
         String::from_utf8_lossy(&engine.stderr)
     );
+    let tar = root();
+    let mut import = Command::new("docker")
+        .args(["import", "-", IMAGE])
+        .stdin(Stdio::piped())
+        .stdout(Stdio::null())
+        .spawn()
+        .expect("the docker client runs");
+    import.stdin.take().expect("piped").write_all(&tar).expect("docker reads it");
+    assert!(import.wait().expect("it is ours").success(), "docker import failed");
+}
+
+/// The files of a small system as a tar: a static busybox and its applets.
+pub(crate) fn root() -> Vec<u8> {
     let root = tempfile::tempdir().expect("a temporary directory");
     let bin = root.path().join("bin");
     std::fs::create_dir(&bin).expect("it is empty");
@@ -41,14 +54,12 @@ pub fn image() {
         .output()
         .expect("tar");
     assert!(tar.status.success(), "{}", String::from_utf8_lossy(&tar.stderr));
-    let mut import = Command::new("docker")
-        .args(["import", "-", IMAGE])
-        .stdin(Stdio::piped())
-        .stdout(Stdio::null())
-        .spawn()
-        .expect("the docker client runs");
-    import.stdin.take().expect("piped").write_all(&tar.stdout).expect("docker reads it");
-    assert!(import.wait().expect("it is ours").success(), "docker import failed");
+    tar.stdout
+}
+
+/// Removes an image, when it is there.
+pub(crate) fn remove_image(image: &str) {
+    drop(docker(&["image", "rm", "--force", image]));
 }
 
 /// Whether a container of a task is left, running or not.

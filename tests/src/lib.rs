@@ -9,6 +9,7 @@
 //! | [`echo`] | a framework on the Rust SDK, with an executor that sends messages back |
 //! | [`ros`] | a real ROS 1: a roscore of its own, and programs that talk to it |
 //! | [`docker`] | an image without a registry |
+//! | [`registry`] | a registry of images on loopback |
 //! | [`kernel`] | what the kernel says: processes, start times, cgroups |
 //!
 //! A missing piece (a binary, root, Docker) fails the test that needs it; nothing is skipped.
@@ -18,6 +19,7 @@ pub mod docker;
 pub mod echo;
 pub mod kernel;
 pub mod puppet;
+pub mod registry;
 pub mod ros;
 pub mod wait;
 

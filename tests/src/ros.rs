@@ -201,6 +201,12 @@ impl Program {
         }
     }
 
+    /// Its process.
+    #[must_use]
+    pub fn pid(&self) -> u32 {
+        self.child.id().expect("it runs")
+    }
+
     /// Kills it with SIGKILL.
     pub async fn kill(&mut self) {
         self.child.kill().await.expect("it runs");

@@ -35,6 +35,8 @@ pub enum Event {
     Probed(u32, Verdict),
     /// The tasks that it waits for stand so.
     Dependencies(Standing),
+    /// The gate gives its right to drive back: it drove, and is silent.
+    GivenBack,
     /// Everything of it is removed.
     Removed,
     /// Something of it could not be removed.

@@ -250,7 +250,7 @@ impl Workload {
         let mut effects = Vec::new();
         match event {
             Event::Assigned(desired) => self.on_assigned(desired, context, &mut effects),
-            Event::Unassigned => self.on_unassigned(context, &mut effects),
+            Event::Unassigned => self.end("no longer assigned", context, &mut effects),
             Event::Forgotten => {
                 self.forgotten = true;
                 self.end_if_wanted(context, &mut effects);
@@ -266,6 +266,10 @@ impl Workload {
             }
             Event::Probed(..) => {}
             Event::Dependencies(standing) => self.on_dependencies(standing, context, &mut effects),
+            Event::GivenBack => {
+                let reason = "it drove and was silent for too long; the robot is given back";
+                self.end(reason, context, &mut effects);
+            }
             Event::Removed => {
                 if matches!(self.state, State::Removing { .. }) {
                     return Response { effects: vec![Effect::Drop] };
@@ -322,12 +326,12 @@ impl Workload {
         }
     }
 
-    /// The controller gives this node's resources to somebody else only when it was told that nothing
-    /// is left: the end must be heard before the task may be forgotten, so it waits for the release.
-    fn on_unassigned(&mut self, context: Context, effects: &mut Vec<Effect>) {
+    /// Ends it by this node's own decision. The controller gives this node's resources to somebody else only when it was told
+    /// that nothing is left: the end must be heard before the task may be forgotten, so it waits for the release.
+    fn end(&mut self, reason: &str, context: Context, effects: &mut Vec<Effect>) {
         if self.desired.stop.is_none() {
-            let reason = "no longer assigned".to_owned();
-            self.desired.stop = Some(StopOrder { grace_ms: self.desired.grace_ms, reason });
+            let (grace_ms, reason) = (self.desired.grace_ms, reason.to_owned());
+            self.desired.stop = Some(StopOrder { grace_ms, reason });
             self.end_if_wanted(context, effects);
         }
     }

@@ -25,7 +25,7 @@ use crate::clock;
 use crate::driver::chain;
 use crate::durable::{self, FileError, Keep};
 use crate::gate;
-use crate::runtime::launch::{AttemptId, Launch, Limits, Program};
+use crate::runtime::launch::{self, AttemptId, Launch, Limits, Program};
 use crate::runtime::{Runtime, RuntimeError};
 
 /// Between two tries to write a work's record. Its update is not acknowledged before.
@@ -68,6 +68,12 @@ struct Desk {
 }
 
 impl Desk {
+    fn is_executor_of(&self, work: &launch::Work) -> bool {
+        let framework = self.framework.as_ref().map(|framework| &framework.id);
+        (&self.namespace, &self.name, framework)
+            == (&work.namespace, &work.executor, work.framework.as_ref())
+    }
+
     /// Takes note of where its task is; whether that was known.
     fn learn(&mut self, life: Life, over: bool) -> bool {
         let known = (self.machine.life(), self.over) == (life, over);
@@ -217,10 +223,10 @@ impl Desks {
         });
     }
 
-    pub(super) fn choose(&self, namespace: &str, name: &str) -> Choice {
+    /// The executor of the work's name, in its namespace and of its framework: no other's work is done there.
+    pub(super) fn choose(&self, work: &launch::Work) -> Choice {
         let desks = self.desks();
-        let named =
-            || desks.iter().filter(|(_, desk)| desk.namespace == namespace && desk.name == name);
+        let named = || desks.iter().filter(|(_, desk)| desk.is_executor_of(work));
         if let Some((uid, _)) = named().find(|(_, desk)| desk.machine.accepts()) {
             return Choice::Ready(uid.clone());
         }
@@ -231,7 +237,7 @@ impl Desks {
     /// Gives the work to its executor, if that would take it now.
     pub(super) fn claim(&self, launch: &Launch) -> Option<TaskUid> {
         let Program::Work(work) = &launch.program else { return None };
-        let Choice::Ready(executor) = self.choose(&work.namespace, &work.executor) else {
+        let Choice::Ready(executor) = self.choose(work) else {
             return None;
         };
         let mut desks = self.desks();
@@ -343,7 +349,7 @@ impl Desks {
     /// Without a connection nothing is sent: who registers hears it then.
     fn send(&self, executor: &TaskUid, say: Say) {
         if let Some(out) = self.desks().get(executor).and_then(|desk| desk.out.as_ref()) {
-            out.push(event(say), 0);
+            out.push_always(event(say));
         }
     }
 
@@ -373,7 +379,7 @@ impl Desks {
             framework_id: framework.id,
         };
         let out = Arc::new(Queue::default());
-        out.push(event(Say::Registered(greeting)), 0);
+        out.push_always(event(Say::Registered(greeting)));
         desk.out = Some(Arc::clone(&out));
         Some(out)
     }
@@ -408,7 +414,7 @@ impl Desks {
         let size = data.len();
         let out = self.desks().get(executor).and_then(|desk| desk.out.clone());
         let say = Say::Message(proto::Message { data });
-        let taken = out.is_some_and(|out| out.push(event(say), size.max(1)));
+        let taken = out.is_some_and(|out| out.push(event(say), size).is_ok());
         if !taken {
             tracing::warn!(%executor, size, "a framework's message is dropped: nobody reads it");
         }

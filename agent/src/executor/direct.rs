@@ -25,17 +25,17 @@ use rustix::net::sockopt;
 use rustls::ServerConfig;
 use tokio::io::{AsyncRead, AsyncReadExt as _, AsyncWrite, AsyncWriteExt as _, BufReader};
 use tokio::net::{TcpListener, TcpStream};
-use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tokio::task::JoinSet;
 use tokio::time::timeout;
 use tokio_rustls::TlsAcceptor;
 use tokio_rustls::server::TlsStream;
+use tokio_util::sync::CancellationToken;
 use tokio_util::task::AbortOnDropHandle;
 
 use super::desk::Desks;
 use super::post::Reins;
 
-/// Connections that have not yet shown a ticket; more are refused.
+/// Connections that have not yet shown a ticket; for more the oldest have to go.
 const MOST_STRANGERS: usize = 8;
 
 /// Connections in all. Each may hold one message that has not come whole; frameworks of more executors go through the
@@ -136,18 +136,27 @@ async fn listen(at: SocketAddr, tls: TlsAcceptor, desks: Arc<Desks>) -> io::Resu
 }
 
 async fn serve(listener: TcpListener, tls: TlsAcceptor, desks: Arc<Desks>) {
-    let strangers = Arc::new(Semaphore::new(MOST_STRANGERS));
+    let mut strangers: VecDeque<CancellationToken> = VecDeque::new();
     let mut lines = JoinSet::new();
     loop {
         // Cancel-safe: a listener and a set of tasks.
         tokio::select! {
             accepted = listener.accept() => match accepted {
-                Ok((tcp, from)) => match Arc::clone(&strangers).try_acquire_owned() {
-                    Ok(stranger) if lines.len() < MOST_LINES => {
-                        lines.spawn(line(tcp, tls.clone(), Arc::clone(&desks), stranger));
+                Ok((_, from)) if lines.len() >= MOST_LINES + MOST_STRANGERS => {
+                    tracing::warn!(%from, "too many frameworks come directly");
+                }
+                Ok((tcp, _)) => {
+                    strangers.retain(|stranger| !stranger.is_cancelled());
+                    // Who says nothing does not keep others out.
+                    if strangers.len() >= MOST_STRANGERS
+                        && let Some(oldest) = strangers.pop_front()
+                    {
+                        oldest.cancel();
                     }
-                    _ => tracing::warn!(%from, "too many frameworks come directly"),
-                },
+                    let stranger = CancellationToken::new();
+                    strangers.push_back(stranger.clone());
+                    lines.spawn(line(tcp, tls.clone(), Arc::clone(&desks), stranger));
+                }
                 Err(error) => {
                     tracing::warn!(%error, "the listener for frameworks");
                     // Out of descriptors, most likely: not in a tight loop.
@@ -178,14 +187,15 @@ enum Ended {
 
 type Stream = TlsStream<BufReader<TcpStream>>;
 
-/// A connection from its first byte to its last.
-async fn line(tcp: TcpStream, tls: TlsAcceptor, desks: Arc<Desks>, stranger: OwnedSemaphorePermit) {
-    let greeted = timeout(OPEN_WITHIN, greet(tcp, &tls)).await.unwrap_or(Err(Ended::NoHello));
+/// A connection from its first byte to its last. `stranger`: it has to make room for others; cancelled when it is none any more.
+async fn line(tcp: TcpStream, tls: TlsAcceptor, desks: Arc<Desks>, stranger: CancellationToken) {
+    let greeting = stranger.run_until_cancelled(timeout(OPEN_WITHIN, greet(tcp, &tls)));
+    let greeted = greeting.await.and_then(Result::ok).unwrap_or(Err(Ended::NoHello));
     let opened = greeted.and_then(|(stream, hello)| {
         let (uid, reins) = desks.posts.open(&hello).ok_or(Ended::NoTicket)?;
         Ok((stream, Guest { desks, uid, line: hello.line, reins }))
     });
-    drop(stranger);
+    stranger.cancel();
     match opened {
         Ok((stream, guest)) => {
             tracing::info!(uid = %guest.uid, line = %guest.line, "a framework came directly");

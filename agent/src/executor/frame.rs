@@ -19,13 +19,22 @@ where
     M: Message + Default,
     R: AsyncRead + Unpin,
 {
+    read_within(FRAME_MAX, from).await
+}
+
+/// The same for frames of at most `longest` bytes.
+pub(crate) async fn read_within<M, R>(longest: usize, from: &mut R) -> io::Result<Option<M>>
+where
+    M: Message + Default,
+    R: AsyncRead + Unpin,
+{
     let length = match from.read_u32().await {
         Err(error) if error.kind() == io::ErrorKind::UnexpectedEof => return Ok(None),
         length => usize::try_from(length?).unwrap_or(usize::MAX),
     };
     let invalid = |text: String| io::Error::new(io::ErrorKind::InvalidData, text);
-    if length > FRAME_MAX {
-        return Err(invalid(format!("a frame of {length} bytes; the longest is {FRAME_MAX}")));
+    if length > longest {
+        return Err(invalid(format!("a frame of {length} bytes; the longest is {longest}")));
     }
     let mut bytes = BytesMut::with_capacity(length);
     while bytes.len() < length {

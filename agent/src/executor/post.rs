@@ -23,7 +23,7 @@ use tokio_util::sync::CancellationToken;
 
 use super::desk::Desks;
 use super::frame::MESSAGE_MAX;
-use super::queue::{MOST_BYTES, Queue};
+use super::queue::{MOST_BYTES, Queue, Refused, cost};
 
 /// One executor's.
 #[derive(Debug, Default)]
@@ -47,7 +47,7 @@ pub(super) struct Reins {
 #[derive(Debug, Default)]
 pub(super) struct Table {
     posts: BTreeMap<TaskUid, Post>,
-    /// Bytes that wait for lines, of all executors: bounded as those that wait for the controller are.
+    /// What waits for lines, of all executors, as [`cost`]: bounded as what waits for the controller is.
     waiting: usize,
 }
 
@@ -82,13 +82,17 @@ impl Posts {
             match effect {
                 Effect::Deliver => deliver = true,
                 Effect::Relay(data) => {
-                    table.waiting -= data.len();
+                    table.waiting -= cost(data.len());
                     self.relay(uid, data);
                 }
                 Effect::Mark(line) => {
                     let mark = line.number();
                     let executor = uid.to_string();
-                    self.relayed.push(Message { executor, mark, ..Message::default() }, 0);
+                    let mark = Message { executor, mark, ..Message::default() };
+                    // One that is lost ends its line: what waits for that goes the other way.
+                    if let Err(why) = self.relayed.push(mark, 0) {
+                        tracing::debug!(%uid, ?why, "a mark is lost");
+                    }
                 }
                 Effect::Wake(_) => {
                     if let Some(reins) = &post.reins {
@@ -108,8 +112,14 @@ impl Posts {
     fn relay(&self, uid: &TaskUid, data: Bytes) {
         let size = data.len();
         let message = Message { executor: uid.to_string(), data, mark: 0 };
-        if !self.relayed.push(message, size.max(1)) {
-            tracing::warn!(%uid, size, "an executor's message is dropped: the controller does not keep up");
+        match self.relayed.push(message, size) {
+            Ok(()) => {}
+            Err(Refused::Shut) => {
+                tracing::debug!(%uid, size, "an executor's message is lost: no controller");
+            }
+            Err(Refused::Full) => {
+                tracing::warn!(%uid, size, "an executor's message is lost: the controller does not keep up");
+            }
         }
     }
 
@@ -124,7 +134,7 @@ impl Posts {
         let mut table = self.table();
         let out = table.posts.get_mut(uid)?.end.take(line)?;
         if let Out::Message(data) = &out {
-            table.waiting -= data.len();
+            table.waiting -= cost(data.len());
         }
         Some(out)
     }
@@ -150,15 +160,32 @@ impl Posts {
     }
 }
 
+/// A time in which the controller can be reached.
+#[derive(Debug)]
+pub(crate) struct InReach<'a>(&'a Queue<Message>);
+
+impl InReach<'_> {
+    /// What was under way is lost.
+    pub(crate) fn broke(&self) {
+        self.0.clear();
+    }
+}
+
+impl Drop for InReach<'_> {
+    fn drop(&mut self) {
+        self.0.shut();
+    }
+}
+
 impl Desks {
     /// A message of an executor for its framework.
     pub(super) fn say(&self, uid: &TaskUid, data: Bytes) {
         let (posts, size) = (&self.posts, data.len());
         let mut table = posts.table();
-        if size > MESSAGE_MAX || table.waiting + size > MOST_BYTES {
+        if size > MESSAGE_MAX || table.waiting + cost(size) > MOST_BYTES {
             tracing::warn!(%uid, size, "an executor's message is dropped");
         } else if table.posts.contains_key(uid) {
-            table.waiting += size;
+            table.waiting += cost(size);
             posts.handle(&mut table, uid, Event::Send(data));
         } else {
             posts.relay(uid, data);
@@ -168,6 +195,13 @@ impl Desks {
     /// The next message or mark for a framework. Cancel-safe.
     pub(crate) async fn said(&self) -> Message {
         self.posts.relayed.pop().await
+    }
+
+    /// The controller is there, until what this gives is dropped: what is said meanwhile waits for it, and is lost at other
+    /// times.
+    pub(crate) fn in_reach(&self) -> InReach<'_> {
+        self.posts.relayed.open();
+        InReach(&self.posts.relayed)
     }
 
     /// A message or a mark of a framework, through the controller.
@@ -273,6 +307,7 @@ mod tests {
         let line = Line::new(1).unwrap();
         let (uid, _reins) = desks.posts.open(&hello(1, 7)).unwrap();
         assert_eq!(desks.said().await.mark, 1);
+        let _in_reach = desks.in_reach();
         let large = Bytes::from(vec![1; MESSAGE_MAX]);
         for _ in 0..5 {
             desks.say(&uid, large.clone());
@@ -280,7 +315,7 @@ mod tests {
         assert_eq!(desks.posts.table().waiting, MOST_BYTES, "the fifth is dropped");
         desks.posts.happened(&uid, Event::Passed(line));
         assert_eq!(desks.posts.take(&uid, line), Some(Out::Message(large.clone())));
-        assert_eq!(desks.posts.table().waiting, 3 * MESSAGE_MAX);
+        assert_eq!(desks.posts.table().waiting, 3 * cost(MESSAGE_MAX));
         desks.say(&uid, "last".into());
         desks.posts.happened(&uid, Event::Closed(line));
         assert_eq!(desks.posts.table().waiting, 0);

@@ -1,76 +1,165 @@
-//! What waits for one reader, in order, bounded by size.
+//! What waits for one reader, in order, bounded by what it takes in memory.
 
 use std::collections::VecDeque;
-use std::sync::{Mutex, PoisonError};
+use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use tokio::sync::Notify;
 
-/// Bytes of messages that wait; four of the longest. A reader that is further behind loses some.
-pub(super) const MOST_BYTES: usize = 4 * super::frame::MESSAGE_MAX;
+use super::frame::MESSAGE_MAX;
+
+/// What an item takes beside its payload, about, bytes: many small messages are bounded as well.
+const BESIDE: usize = 256;
+
+/// Bytes that wait; four of the longest messages. A reader that is further behind loses some.
+pub(super) const MOST_BYTES: usize = 4 * cost(MESSAGE_MAX);
+
+/// What a message of so many bytes takes while it waits.
+pub(super) const fn cost(bytes: usize) -> usize {
+    bytes + BESIDE
+}
 
 /// The queue.
 #[derive(Debug)]
 pub(crate) struct Queue<T> {
     waiting: Mutex<Waiting<T>>,
     more: Notify,
+    less: Notify,
 }
 
 #[derive(Debug)]
 struct Waiting<T> {
     items: VecDeque<(T, usize)>,
-    bytes: usize,
+    cost: usize,
+    shut: bool,
 }
 
 impl<T> Default for Queue<T> {
     fn default() -> Self {
-        let waiting = Waiting { items: VecDeque::new(), bytes: 0 };
-        Queue { waiting: Mutex::new(waiting), more: Notify::new() }
+        let waiting = Waiting { items: VecDeque::new(), cost: 0, shut: false };
+        Queue { waiting: Mutex::new(waiting), more: Notify::new(), less: Notify::new() }
     }
 }
 
+/// Why an item was not taken.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Refused {
+    /// Too much waits.
+    Full,
+    /// Nobody reads.
+    Shut,
+}
+
 impl<T> Queue<T> {
-    /// Takes `item` unless too much waits. An item of size 0 is always taken.
-    pub(crate) fn push(&self, item: T, size: usize) -> bool {
-        let mut waiting = self.waiting.lock().unwrap_or_else(PoisonError::into_inner);
-        if size > 0 && waiting.bytes + size > MOST_BYTES {
-            return false;
+    fn waiting(&self) -> MutexGuard<'_, Waiting<T>> {
+        self.waiting.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Takes an item with a payload of so many bytes, unless too much waits.
+    pub(crate) fn push(&self, item: T, bytes: usize) -> Result<(), Refused> {
+        let mut waiting = self.waiting();
+        if waiting.shut {
+            return Err(Refused::Shut);
         }
-        waiting.bytes += size;
-        waiting.items.push_back((item, size));
-        drop(waiting);
+        if waiting.cost + cost(bytes) > MOST_BYTES {
+            return Err(Refused::Full);
+        }
+        self.take(&mut waiting, item, bytes);
+        Ok(())
+    }
+
+    /// Takes an item however much waits: one that nobody may lose, and that [`Queue::room`] bounds.
+    pub(crate) fn push_always(&self, item: T) {
+        self.take(&mut self.waiting(), item, 0);
+    }
+
+    fn take(&self, waiting: &mut Waiting<T>, item: T, bytes: usize) {
+        waiting.cost += cost(bytes);
+        waiting.items.push_back((item, bytes));
         self.more.notify_one();
-        true
     }
 
     /// The next item. For one reader at a time; cancel-safe.
     pub(crate) async fn pop(&self) -> T {
         loop {
             let item = {
-                let mut waiting = self.waiting.lock().unwrap_or_else(PoisonError::into_inner);
+                let mut waiting = self.waiting();
                 let next = waiting.items.pop_front();
-                next.map(|(item, size)| {
-                    waiting.bytes -= size;
+                next.map(|(item, bytes)| {
+                    waiting.cost -= cost(bytes);
                     item
                 })
             };
             match item {
-                Some(item) => return item,
+                Some(item) => {
+                    self.less.notify_one();
+                    return item;
+                }
                 None => self.more.notified().await,
             }
         }
+    }
+
+    /// Ready when less than half of what may wait does. For one waiter at a time; cancel-safe.
+    pub(crate) async fn room(&self) {
+        while self.waiting().cost > MOST_BYTES / 2 {
+            self.less.notified().await;
+        }
+    }
+
+    /// Forgets what waits.
+    pub(crate) fn clear(&self) {
+        let mut waiting = self.waiting();
+        waiting.items.clear();
+        waiting.cost = 0;
+    }
+
+    /// Forgets what waits and takes no more until [`Queue::open`].
+    pub(crate) fn shut(&self) {
+        self.waiting().shut = true;
+        self.clear();
+    }
+
+    /// Takes items again.
+    pub(crate) fn open(&self) {
+        self.waiting().shut = false;
     }
 }
 
 #[cfg(test)]
 mod tests {
+    use futures::FutureExt as _;
+
     use super::*;
 
     #[tokio::test]
     async fn in_order_and_bounded() {
         let queue = Queue::default();
-        assert!(queue.push(1, MOST_BYTES) && !queue.push(2, 1) && queue.push(3, 0));
+        assert_eq!(queue.push(1, MOST_BYTES - BESIDE), Ok(()));
+        assert_eq!(queue.push(2, 0), Err(Refused::Full));
+        queue.push_always(3);
+        assert!(queue.room().now_or_never().is_none());
         assert_eq!((queue.pop().await, queue.pop().await), (1, 3));
-        assert!(queue.push(4, 1));
+        queue.room().await;
+        assert_eq!(queue.push(4, 1), Ok(()));
         assert_eq!(queue.pop().await, 4);
+        assert_eq!(queue.waiting().cost, 0);
+    }
+
+    #[test]
+    fn small_items_are_bounded_too() {
+        let queue = Queue::default();
+        let taken = (0..).take_while(|_| queue.push((), 0).is_ok()).count();
+        assert_eq!(taken, MOST_BYTES / BESIDE);
+    }
+
+    #[tokio::test]
+    async fn what_waits_when_it_is_shut_is_lost() {
+        let queue = Queue::default();
+        assert_eq!(queue.push(1, 1), Ok(()));
+        queue.shut();
+        assert_eq!(queue.push(2, 1), Err(Refused::Shut));
+        queue.open();
+        assert_eq!(queue.push(3, 1), Ok(()));
+        assert_eq!(queue.pop().await, 3);
     }
 }

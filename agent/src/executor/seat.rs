@@ -13,6 +13,7 @@ use std::time::Duration;
 use futures::future::{BoxFuture, FutureExt};
 use futures::stream::{FuturesUnordered, StreamExt};
 use muster_api::id::TaskUid;
+use muster_api::secret::same;
 use muster_api::wire::executor::v1 as proto;
 use proto::call::Call as Said;
 use tokio::net::{UnixListener, UnixStream};
@@ -106,12 +107,6 @@ async fn greet(mut stream: UnixStream, token: String) -> io::Result<(UnixStream,
     Ok((stream, register))
 }
 
-/// In a time that does not tell how much of it was right.
-fn same(shown: &[u8], token: &[u8]) -> bool {
-    let differences = shown.iter().zip(token).fold(0, |all, (a, b)| all | (a ^ b));
-    shown.len() == token.len() && std::hint::black_box(differences) == 0
-}
-
 async fn talk(desks: Arc<Desks>, uid: TaskUid, stream: UnixStream, register: proto::Register) {
     let Some(out) = desks.connect(&uid) else { return };
     tracing::info!(%uid, works = register.tasks.len(), "an executor registered");
@@ -124,7 +119,12 @@ async fn talk(desks: Arc<Desks>, uid: TaskUid, stream: UnixStream, register: pro
     };
     let read = async {
         desks.registered(&uid, register).await;
-        while let Some(call) = frame::read::<proto::Call, _>(&mut from).await? {
+        loop {
+            // Whoever does not read the answers is not heard.
+            out.room().await;
+            let Some(call) = frame::read::<proto::Call, _>(&mut from).await? else {
+                return Ok(());
+            };
             match call.call {
                 Some(Said::StatusUpdate(update)) => desks.updated(&uid, update).await,
                 Some(Said::Message(message)) => desks.say(&uid, message.data),
@@ -132,7 +132,6 @@ async fn talk(desks: Arc<Desks>, uid: TaskUid, stream: UnixStream, register: pro
                 None => tracing::warn!(%uid, "an executor says something newer than this agent"),
             }
         }
-        Ok(())
     };
     // Neither is polled again after the other has ended.
     let ended: io::Result<()> = tokio::select! {

@@ -35,7 +35,7 @@ impl WorkRuntime {
         let Program::Work(work) = &launch.program else { return Ok(()) };
         let mut changes = self.desks.changes();
         loop {
-            match self.desks.choose(&work.namespace, &work.executor) {
+            match self.desks.choose(work) {
                 Choice::Ready(_) => return Ok(()),
                 Choice::Never => {
                     let message = format!("its executor {:?} has ended", work.executor);

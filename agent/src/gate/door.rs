@@ -23,6 +23,9 @@ const SHOW_WITHIN: Duration = Duration::from_secs(5);
 /// Connections at once. A robot has one holder and a few delegates.
 const MOST: usize = 64;
 
+/// Longest frame of a task, bytes.
+const LONGEST_CALL: usize = 64 << 10;
+
 /// Answers that may wait for a slow reader. It waits for each, or is not of good will.
 pub(super) const ANSWERS: usize = 64;
 
@@ -30,7 +33,7 @@ pub(super) const ANSWERS: usize = 64;
 pub(super) type Back<M> = mpsc::Sender<M>;
 
 /// Listens at `path`, for those who may write to a file of `mode`.
-pub(super) fn listen(path: &Path, mode: u32) -> io::Result<UnixListener> {
+pub(crate) fn listen(path: &Path, mode: u32) -> io::Result<UnixListener> {
     match fs::remove_file(path) {
         Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(error),
         _ => {}
@@ -40,8 +43,12 @@ pub(super) fn listen(path: &Path, mode: u32) -> io::Result<UnixListener> {
     Ok(listener)
 }
 
-/// Takes tasks in until dropped.
-pub(super) async fn tasks(listener: UnixListener, inputs: mpsc::Sender<Input>) {
+/// Takes tasks in until dropped. That one is gone is `urgent`.
+pub(super) async fn tasks(
+    listener: UnixListener,
+    inputs: mpsc::Sender<Input>,
+    urgent: mpsc::Sender<Input>,
+) {
     let mut talks = JoinSet::new();
     let mut next = 0;
     loop {
@@ -50,7 +57,7 @@ pub(super) async fn tasks(listener: UnixListener, inputs: mpsc::Sender<Input>) {
             accepted = listener.accept() => match accepted {
                 Ok((stream, _)) if talks.len() < MOST => {
                     next += 1;
-                    talks.spawn(task(Conn(next), stream, inputs.clone()));
+                    talks.spawn(task(Conn(next), stream, inputs.clone(), urgent.clone()));
                 }
                 Ok(_) => tracing::warn!("too many connections of tasks"),
                 Err(error) => {
@@ -63,8 +70,14 @@ pub(super) async fn tasks(listener: UnixListener, inputs: mpsc::Sender<Input>) {
     }
 }
 
-async fn task(conn: Conn, mut stream: UnixStream, inputs: mpsc::Sender<Input>) {
-    let first = tokio::time::timeout(SHOW_WITHIN, frame::read(&mut stream)).await;
+async fn task(
+    conn: Conn,
+    mut stream: UnixStream,
+    inputs: mpsc::Sender<Input>,
+    urgent: mpsc::Sender<Input>,
+) {
+    let first = frame::read_within(LONGEST_CALL, &mut stream);
+    let first = tokio::time::timeout(SHOW_WITHIN, first).await;
     let Ok(Ok(Some(proto::Call { call: Some(Said::Register(register)) }))) = first else { return };
     let (back, answers) = mpsc::channel(ANSWERS);
     let (admit, admitted) = oneshot::channel();
@@ -75,11 +88,12 @@ async fn task(conn: Conn, mut stream: UnixStream, inputs: mpsc::Sender<Input>) {
     }
     // Something newer than this gate is not answered, so whoever says it is not to go on.
     let input = move |call: proto::Call| call.call.map(|call| Input::Call(conn, call));
-    if let Err(error) = talk(stream, answers, &inputs, input).await {
+    if let Err(error) = talk(stream, LONGEST_CALL, answers, &inputs, input).await {
         tracing::info!(%error, "a task's connection");
     }
-    // Closed: the gate ends, and stops the robot.
-    let _ = inputs.send(Input::Closed(conn)).await;
+    // Before what others say, and before what is left of its own: nobody stands behind that any more. Closed: the gate ends,
+    // and stops the robot.
+    let _ = urgent.send(Input::Closed(conn)).await;
 }
 
 /// Takes agents in until dropped. The newest counts.
@@ -108,7 +122,7 @@ async fn agent(life: u64, stream: UnixStream, inputs: mpsc::Sender<Input>) {
     let (back, statuses) = mpsc::channel(ANSWERS);
     let _ = inputs.send(Input::AgentCame(life, back)).await;
     let input = move |wanted: proto::Wanted| Some(Input::Wanted(life, wanted));
-    if let Err(error) = talk(stream, statuses, &inputs, input).await {
+    if let Err(error) = talk(stream, frame::FRAME_MAX, statuses, &inputs, input).await {
         tracing::info!(%error, "the agent's connection");
     }
     let _ = inputs.send(Input::AgentGone(life)).await;
@@ -117,6 +131,7 @@ async fn agent(life: u64, stream: UnixStream, inputs: mpsc::Sender<Input>) {
 /// Reads until the other side closes or says what is no input, and writes what comes back until nobody answers any more.
 async fn talk<In, Out>(
     stream: UnixStream,
+    longest: usize,
     mut back: mpsc::Receiver<Out>,
     inputs: &mpsc::Sender<Input>,
     input: impl Fn(In) -> Option<Input>,
@@ -127,7 +142,7 @@ where
 {
     let (mut from, mut to) = stream.into_split();
     let read = async {
-        while let Some(message) = frame::read::<In, _>(&mut from).await? {
+        while let Some(message) = frame::read_within::<In, _>(longest, &mut from).await? {
             let Some(input) = input(message) else { break };
             if inputs.send(input).await.is_err() {
                 break;

@@ -2,23 +2,22 @@
 
 use std::collections::VecDeque;
 use std::io;
+use std::os::fd::AsRawFd as _;
 use std::process::Stdio;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use bytes::{BufMut as _, Bytes, BytesMut};
-use tokio::io::{AsyncReadExt as _, AsyncWrite, AsyncWriteExt as _};
+use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::UnixStream;
-use tokio::net::unix::OwnedReadHalf;
-use tokio::process::{Child, Command};
+use tokio::net::unix::{OwnedReadHalf, OwnedWriteHalf};
+use tokio::process::{Child, ChildStdin, Command};
 use tokio::sync::{Notify, mpsc, watch};
+use tokio::time::Instant;
 use tokio_util::task::AbortOnDropHandle;
 
 use super::hall::Input;
-use super::settings::{self, Framing};
-
-/// Commands that may wait. They are of a moment: a driver that is this far behind is not driven any more.
-const QUEUE: usize = 16;
+use super::settings::{self, Framing, Waiting};
 
 /// Between two tries to reach a driver.
 const AGAIN: Duration = Duration::from_millis(100);
@@ -26,11 +25,18 @@ const AGAIN: Duration = Duration::from_millis(100);
 /// Between a cut and the end of the driver: it reads its stop, if it reads at all.
 const LAST_WORD: Duration = Duration::from_millis(20);
 
-/// A driver that has not read for this long is begun anew.
-const READS_WITHIN: Duration = Duration::from_millis(200);
+/// A driver that has not read its stop for this long is begun anew.
+const READS_WITHIN: Duration = Duration::from_millis(500);
 
-/// What may lie in a driver's pipe, bytes: the least that the kernel has. What lies there comes before a stop.
+/// The first time: a program has to start.
+const BEGINS_WITHIN: Duration = Duration::from_secs(10);
+
+/// What may lie in a driver's pipe, bytes: the least that the kernel has.
 const PIPE: usize = 4096;
+
+/// Between two looks whether a driver has read its last command. What lies in its pipe comes before a stop, so that is one
+/// command at most.
+const LOOK: Duration = Duration::from_millis(1);
 
 /// A driver as the hall sees it.
 #[derive(Debug)]
@@ -51,8 +57,17 @@ struct Line {
 
 #[derive(Debug, Default)]
 struct State {
-    frames: VecDeque<Bytes>,
+    frames: VecDeque<Frame>,
     there: bool,
+    /// It has not read its newest stop.
+    owes: bool,
+}
+
+#[derive(Debug)]
+struct Frame {
+    bytes: Bytes,
+    /// What it commands; absent: a stop, which does not wait until what is before it was read.
+    actuator: Option<String>,
 }
 
 impl Line {
@@ -61,13 +76,32 @@ impl Line {
     }
 
     /// Cancel safe: a frame that was taken is returned.
-    async fn next(&self) -> Bytes {
+    async fn next(&self, to: &To) -> Frame {
         loop {
-            if let Some(frame) = self.state().frames.pop_front() {
-                return frame;
+            let waits = {
+                let mut state = self.state();
+                match state.frames.front() {
+                    Some(first) if first.actuator.is_none() || to.is_read() => {
+                        state.frames.pop_front().map(Ok)
+                    }
+                    first => first.map(|_| Err(())),
+                }
+            };
+            match waits {
+                Some(Ok(frame)) => return frame,
+                // A stop takes the place of what waits.
+                Some(Err(())) => {
+                    let _ = tokio::time::timeout(LOOK, self.changed.notified()).await;
+                }
+                None => self.changed.notified().await,
             }
-            self.changed.notified().await;
         }
+    }
+
+    /// It has read everything. A stop that was said meanwhile is still to be written.
+    fn stands(&self) {
+        let mut state = self.state();
+        state.owes = state.frames.iter().any(|frame| frame.actuator.is_none());
     }
 
     async fn allowed(&self) {
@@ -85,7 +119,7 @@ impl Line {
 
     fn set_there(&self, there: bool) {
         let mut state = self.state();
-        state.there = there;
+        (state.there, state.owes) = (there, false);
         state.frames.clear();
     }
 }
@@ -102,36 +136,51 @@ impl Driver {
         Driver { settings, line, _task: AbortOnDropHandle::new(tokio::spawn(keeps)) }
     }
 
-    /// Whether it takes the command.
-    pub(super) fn command(&self, data: &Bytes) -> bool {
-        let Some(frame) = framed(self.settings.framing, data) else { return false };
+    /// Whether it takes the command. One that waits for it is of a moment that is over: as the driver is set up, the newer one
+    /// takes its place, or is not taken.
+    pub(super) fn command(&self, actuator: &str, data: &Bytes) -> bool {
+        let Some(bytes) = framed(self.settings.framing, data) else { return false };
         let mut state = self.line.state();
-        if !state.there || state.frames.len() >= QUEUE {
+        if !state.there {
             return false;
         }
-        state.frames.push_back(frame);
+        let same = |frame: &&mut Frame| frame.actuator.as_deref() == Some(actuator);
+        match (state.frames.iter_mut().find(same), self.settings.waiting) {
+            (Some(_), Waiting::Each) => return false,
+            (Some(frame), Waiting::Newest) => frame.bytes = bytes,
+            (None, _) => {
+                state.frames.push_back(Frame { bytes, actuator: Some(actuator.to_owned()) });
+            }
+        }
         drop(state);
         self.line.changed.notify_one();
         true
     }
 
+    /// Whether it has read its newest stop.
+    pub(super) fn stands(&self) -> bool {
+        !self.line.state().owes
+    }
+
     /// Before everything that waits, which is dropped.
     pub(super) fn stop(&self) {
-        self.at_once(&self.settings.stop);
+        self.at_once([self.settings.stop.as_str()]);
     }
 
     /// The same with the hold command.
     pub(super) fn hold(&self) {
-        self.at_once(self.settings.hold.as_ref().unwrap_or(&self.settings.stop));
+        self.at_once([self.settings.hold.as_ref().unwrap_or(&self.settings.stop).as_str()]);
     }
 
-    fn at_once(&self, text: &str) {
-        let Some(frame) = framed(self.settings.framing, text.as_bytes()) else { return };
+    fn at_once<const N: usize>(&self, texts: [&str; N]) {
         let mut state = self.line.state();
         state.frames.clear();
         // One that is not there is stopped as soon as it is.
         if state.there {
-            state.frames.push_back(frame);
+            let frames = texts.map(|text| framed(self.settings.framing, text.as_bytes()));
+            let frame = |bytes| Frame { bytes, actuator: None };
+            state.frames.extend(frames.into_iter().flatten().map(frame));
+            state.owes = true;
         }
         drop(state);
         self.line.changed.notify_one();
@@ -140,10 +189,7 @@ impl Driver {
     /// Cuts the power, by the driver's own command; one that has none is ended until `cut` is said to be over.
     pub(super) fn cut(&self) {
         match &self.settings.cut {
-            Some(text) => {
-                self.stop();
-                let _ = self.command(&Bytes::copy_from_slice(text.as_bytes()));
-            }
+            Some(text) => self.at_once([&self.settings.stop, text]),
             None => self.keep_off(true),
         }
     }
@@ -184,7 +230,7 @@ async fn keep(at: usize, settings: settings::Driver, line: Arc<Line>, inputs: mp
                 // Neither is polled again after the other has ended.
                 let error = tokio::select! {
                     error = end.gone() => Some(error),
-                    error = feed(&line, &mut to) => Some(error),
+                    error = feed(&line, &mut to, &inputs) => Some(error),
                     () = line.cut_off() => None,
                 };
                 line.set_there(false);
@@ -244,7 +290,31 @@ impl End {
     }
 }
 
-type To = Box<dyn AsyncWrite + Send + Unpin>;
+/// Where its commands go.
+enum To {
+    Pipe(ChildStdin),
+    Socket(OwnedWriteHalf),
+}
+
+impl To {
+    async fn write(&mut self, frame: &[u8]) -> io::Result<()> {
+        match self {
+            To::Pipe(to) => to.write_all(frame).await,
+            To::Socket(to) => to.write_all(frame).await,
+        }
+    }
+
+    /// Whether everything that was written has been read. What the kernel does not tell counts as read.
+    fn is_read(&self) -> bool {
+        let mut bytes: libc::c_int = 0;
+        let (fd, what) = match self {
+            To::Pipe(to) => (to.as_raw_fd(), libc::FIONREAD),
+            To::Socket(to) => (to.as_ref().as_raw_fd(), libc::TIOCOUTQ),
+        };
+        // SAFETY: the descriptor is open, and both requests write one int.
+        unsafe { libc::ioctl(fd, what, &mut bytes) != 0 || bytes == 0 }
+    }
+}
 
 async fn reach(settings: &settings::Driver) -> io::Result<(To, End)> {
     if let Some(path) = &settings.unix {
@@ -252,7 +322,7 @@ async fn reach(settings: &settings::Driver) -> io::Result<(To, End)> {
         // The kernel takes no less than its least.
         rustix::net::sockopt::set_socket_send_buffer_size(&stream, PIPE)?;
         let (from, to) = stream.into_split();
-        return Ok((Box::new(to), End::Socket(from)));
+        return Ok((To::Socket(to), End::Socket(from)));
     }
     let missing = || io::Error::new(io::ErrorKind::InvalidInput, "no program");
     let (program, args) = settings.exec.split_first().ok_or_else(missing)?;
@@ -272,27 +342,156 @@ async fn reach(settings: &settings::Driver) -> io::Result<(To, End)> {
     let mut child = command.spawn()?;
     let to = child.stdin.take().ok_or_else(|| io::Error::other("its pipe is not there"))?;
     rustix::pipe::fcntl_setpipe_size(&to, PIPE)?;
-    Ok((Box::new(to), End::Program(child)))
+    Ok((To::Pipe(to), End::Program(child)))
 }
 
-/// Until it does not read any more.
-async fn feed(line: &Line, to: &mut To) -> io::Error {
+/// Until it does not read any more. Says whenever it has read its stop.
+async fn feed(line: &Line, to: &mut To, inputs: &mpsc::Sender<Input>) -> io::Error {
+    let deaf = || io::Error::new(io::ErrorKind::TimedOut, "it does not read its commands");
+    let mut within = BEGINS_WITHIN;
+    let mut unread: Option<Instant> = None;
     loop {
-        let frame = line.next().await;
-        match tokio::time::timeout(READS_WITHIN, to.write_all(&frame)).await {
+        // Neither takes anything before it is done.
+        let frame = tokio::select! {
+            frame = line.next(to) => frame,
+            read = reads(to, unread) => match read {
+                true => {
+                    (unread, within) = (None, READS_WITHIN);
+                    line.stands();
+                    // Closed: the gate ends.
+                    let _ = inputs.send(Input::DriverStands).await;
+                    continue;
+                }
+                false => return deaf(),
+            },
+        };
+        match tokio::time::timeout(within, to.write(&frame.bytes)).await {
             Ok(Ok(())) => {}
             Ok(Err(error)) => return error,
             // A stop may wait behind it, and would wait for ever.
-            Err(_) => {
-                return io::Error::new(io::ErrorKind::TimedOut, "it does not read its commands");
-            }
+            Err(_) => return deaf(),
+        }
+        if frame.actuator.is_none() {
+            unread.get_or_insert_with(|| Instant::now() + within);
+        }
+    }
+}
+
+/// Whether it has read everything until then; never, if it owes nothing.
+async fn reads(to: &To, until: Option<Instant>) -> bool {
+    let Some(until) = until else { return std::future::pending().await };
+    loop {
+        match to.is_read() {
+            true => return true,
+            false if Instant::now() >= until => return false,
+            false => tokio::time::sleep(LOOK).await,
         }
     }
 }
 
 #[cfg(test)]
 mod tests {
+    use std::path::Path;
+
+    use tokio::net::UnixListener;
+
     use super::*;
+
+    /// A driver that reads nothing, and where it is reached.
+    fn deaf(at: &Path) -> (settings::Driver, UnixListener) {
+        let listener = UnixListener::bind(at).unwrap();
+        let settings = serde_json::json!({"actuators": ["base:Drive"], "unix": at, "stop": "stop"});
+        (serde_json::from_value(settings).unwrap(), listener)
+    }
+
+    async fn reached(
+        settings: settings::Driver,
+        listener: &UnixListener,
+    ) -> (Driver, UnixStream, mpsc::Receiver<Input>) {
+        let (inputs, mut heard) = mpsc::channel(4);
+        let driver = Driver::start(0, settings, inputs);
+        let (stream, _) = listener.accept().await.unwrap();
+        assert!(matches!(heard.recv().await, Some(Input::DriverBack(0))));
+        (driver, stream, heard)
+    }
+
+    /// Until what waits has been written.
+    async fn written(driver: &Driver) {
+        while !driver.line.state().frames.is_empty() {
+            tokio::task::yield_now().await;
+        }
+    }
+
+    #[tokio::test]
+    async fn one_command_at_most_lies_before_a_stop() {
+        let dir = tempfile::tempdir().unwrap();
+        let (settings, listener) = deaf(&dir.path().join("driver"));
+        let (driver, mut stream, _heard) = reached(settings, &listener).await;
+        let go =
+            |text: &'static str| driver.command("base:Drive", &Bytes::from_static(text.as_bytes()));
+        assert!(go("first"));
+        written(&driver).await;
+        for _ in 0..3 {
+            assert!(go("more"));
+        }
+        // Looked at many times, and not written.
+        for _ in 0..100 {
+            tokio::task::yield_now().await;
+        }
+        driver.stop();
+        written(&driver).await;
+        drop(driver);
+        let mut text = String::new();
+        stream.read_to_string(&mut text).await.unwrap();
+        assert_eq!(text, "first\nstop\n");
+    }
+
+    #[tokio::test]
+    async fn a_driver_that_is_behind_gets_what_is_newest() {
+        let dir = tempfile::tempdir().unwrap();
+        let (mut settings, listener) = deaf(&dir.path().join("driver"));
+        for (waiting, taken, next) in
+            [(Waiting::Newest, true, "twist 20\n"), (Waiting::Each, false, "twist 1\n")]
+        {
+            settings.waiting = waiting;
+            let (driver, mut stream, _heard) = reached(settings.clone(), &listener).await;
+            assert!(driver.command("base:Drive", &Bytes::from_static(b"twist 0")));
+            written(&driver).await;
+            assert!(driver.command("arm:Grasp", &Bytes::from_static(b"close")));
+            assert!(driver.command("base:Drive", &Bytes::from_static(b"twist 1")));
+            for n in 2..=20 {
+                let twist = Bytes::from(format!("twist {n}"));
+                assert_eq!(driver.command("base:Drive", &twist), taken);
+            }
+            let mut read = async |text: &str| {
+                let mut bytes = vec![0; text.len()];
+                stream.read_exact(&mut bytes).await.unwrap();
+                assert_eq!(String::from_utf8(bytes).unwrap(), text);
+            };
+            for text in ["twist 0\n", "close\n", next] {
+                read(text).await;
+            }
+        }
+    }
+
+    #[tokio::test]
+    async fn a_driver_that_does_not_read_its_stop_is_begun_anew() {
+        let dir = tempfile::tempdir().unwrap();
+        let (settings, listener) = deaf(&dir.path().join("driver"));
+        let (driver, mut stream, mut heard) = reached(settings, &listener).await;
+        driver.stop();
+        assert!(!driver.stands());
+        let mut stop = [0; 5];
+        stream.read_exact(&mut stop).await.unwrap();
+        assert!(matches!(heard.recv().await, Some(Input::DriverStands)));
+        assert!(driver.stands());
+        driver.stop();
+        match heard.recv().await {
+            Some(Input::DriverGone(0, why)) => assert!(why.contains("does not read"), "{why}"),
+            _ => panic!("it is there"),
+        }
+        listener.accept().await.unwrap();
+    }
 
     #[test]
     fn frames() {

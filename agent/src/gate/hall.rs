@@ -6,8 +6,7 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use muster_agent_core::gate::{
-    Conn, DEEPEST, Effect, Event, Gate, Grant, Kept, Response, Source, StopReason, Tier, Token,
-    Verdict,
+    Conn, DEEPEST, Effect, Event, Gate, Grant, Response, Source, StopReason, Tier, Token, Verdict,
 };
 use muster_agent_core::time::Boot;
 use muster_api::id::{Epoch, TaskUid};
@@ -17,20 +16,18 @@ use proto::call::Call as Said;
 use tokio::signal::unix::{Signal, SignalKind, signal};
 use tokio::sync::{mpsc, oneshot};
 use tokio::task::JoinSet;
-use tokio::time::Instant;
+use tokio::time::{Instant, MissedTickBehavior};
 
 use super::door::{self, Back};
 use super::driver::Driver;
+use super::log::Log;
+use super::record::{self, Record};
 use super::settings::Settings;
-use super::{AGENT_SOCKET, GateError, SOCKET, TASKS_DIR, hook, keeper};
+use super::{AGENT_SOCKET, GateError, LOG, SOCKET, TASKS_DIR, hook, keeper};
 use crate::clock;
-use crate::durable::{self, Keep};
 
 /// Inputs that may wait. Whoever says more waits until they were looked at.
 const INPUTS: usize = 256;
-
-/// What a gate that begins must know.
-const KEPT: &str = "kept.json";
 
 /// Longest command, bytes.
 const LONGEST: usize = 60 << 10;
@@ -57,8 +54,34 @@ pub(super) enum Input {
     Wanted(u64, proto::Wanted),
     AgentGone(u64),
     DriverBack(usize),
+    /// A driver has read its stop.
+    DriverStands,
     DriverGone(usize, String),
     Hook(String, Tier),
+}
+
+/// What a call of a task is about.
+struct About {
+    conn: Conn,
+    id: u64,
+    /// What is to be handed to a driver; absent: it is no command.
+    command: Option<Command>,
+}
+
+struct Command {
+    /// Absent: no driver moves that.
+    driver: Option<usize>,
+    actuator: String,
+    data: Bytes,
+}
+
+/// The rest of a call's effects, which must not happen before the record is durable.
+struct Waits {
+    about: About,
+    verdict: Verdict,
+    forward: bool,
+    /// How often the robot had been stopped.
+    stops: u64,
 }
 
 struct Hall {
@@ -74,207 +97,210 @@ struct Hall {
     conns: BTreeMap<Conn, (TaskUid, Back<proto::Event>)>,
     /// The newest connection; its way back is gone when it does not read.
     agent: Option<(u64, Option<Back<proto::Status>>)>,
+    /// The newest that it wants, and the newest that counts.
+    asked: u64,
     wanted: u64,
     /// When the agent last said something.
     heard: Instant,
     silent: u64,
     gives_back: Option<Grant>,
     wake: Option<Boot>,
+    record: Record<Waits>,
+    /// How often the robot was stopped.
+    stops: u64,
 }
 
 /// Runs until it is told to end.
 pub(super) async fn serve(dir: PathBuf, settings: Settings) -> Result<(), GateError> {
     let system = |what| move |source| GateError::System { what, source };
-    let kept: Kept = durable::read_json(&dir.join(KEPT))?.unwrap_or_default();
+    let kept = record::read(&dir)?;
     let mut end = signal(SignalKind::terminate()).map_err(system("hear signals"))?;
     let tasks = door::listen(&dir.join(TASKS_DIR).join(SOCKET), 0o666)
         .map_err(system("listen for tasks"))?;
     let agents =
         door::listen(&dir.join(AGENT_SOCKET), 0o600).map_err(system("listen for agents"))?;
-    let (inputs, mut received) = mpsc::channel(INPUTS);
+    let (inputs, mut calls) = mpsc::channel(INPUTS);
+    let (urgently, mut urgent) = mpsc::channel(INPUTS);
     let (core, response) = Gate::start(settings.core(), kept);
     let driver =
-        |(at, driver): (usize, &_)| Driver::start(at, Clone::clone(driver), inputs.clone());
+        |(at, driver): (usize, &_)| Driver::start(at, Clone::clone(driver), urgently.clone());
     let drivers: Vec<Driver> = settings.drivers.iter().enumerate().map(driver).collect();
     let mut others = JoinSet::new();
     for hook in settings.estop.clone() {
-        others.spawn(hook::follow(hook, inputs.clone()));
+        others.spawn(hook::follow(hook, urgently.clone()));
     }
-    others.spawn(door::tasks(tasks, inputs.clone()));
-    others.spawn(door::agents(agents, inputs));
-    let mut hall = Hall {
-        digest: keeper::digest(&settings),
-        missing: vec![Some("it has not been reached yet".to_owned()); drivers.len()],
-        dir,
-        core,
-        drivers,
-        seats: BTreeMap::new(),
-        conns: BTreeMap::new(),
-        agent: None,
-        wanted: 0,
-        heard: Instant::now(),
-        silent: 0,
-        gives_back: None,
-        wake: None,
-    };
+    others.spawn(door::tasks(tasks, inputs, urgently.clone()));
+    others.spawn(door::agents(agents, urgently));
+    let record = Record::new(record::write_to(&dir));
+    let mut hall = Hall::new(dir, keeper::digest(&settings), (core, drivers), record);
     tracing::info!(newest = %hall.core.newest(), estop = %hall.core.estop().tier(), "the gate starts");
-    let ended = hall.run(response, &mut received, &mut end).await;
+    hall.run(response, (&mut urgent, &mut calls), &mut end).await;
     // Nobody stands before the drivers any more.
     hall.drivers.iter().for_each(Driver::stop);
     tokio::time::sleep(LAST_STOP).await;
-    ended
+    Ok(())
 }
 
 impl Hall {
-    /// Until it is told to end, or cannot go on.
+    fn new(
+        dir: PathBuf,
+        digest: String,
+        (core, drivers): (Gate, Vec<Driver>),
+        record: Record<Waits>,
+    ) -> Hall {
+        Hall {
+            dir,
+            digest,
+            core,
+            missing: vec![Some("it has not been reached yet".to_owned()); drivers.len()],
+            drivers,
+            seats: BTreeMap::new(),
+            conns: BTreeMap::new(),
+            agent: None,
+            asked: 0,
+            wanted: 0,
+            heard: Instant::now(),
+            silent: 0,
+            gives_back: None,
+            wake: None,
+            record,
+            stops: 0,
+        }
+    }
+
+    /// Until it is told to end.
     async fn run(
         &mut self,
         first: Response,
-        received: &mut mpsc::Receiver<Input>,
+        (urgent, calls): (&mut mpsc::Receiver<Input>, &mut mpsc::Receiver<Input>),
         end: &mut Signal,
-    ) -> Result<(), GateError> {
-        self.carry_out(first, None).await?;
+    ) {
+        self.carry_out(first, None);
         let mut looks = tokio::time::interval(STUCK / 4);
+        looks.set_missed_tick_behavior(MissedTickBehavior::Delay);
+        let mut log = Log::new(self.dir.join(LOG));
         loop {
-            // Cancel-safe: a signal, a receiver, a sleep and a tick.
+            // Cancel-safe: a signal, receivers, a sleep, the record and a tick. In the order of what they are worth: a task that
+            // says much is not before a button. What tasks say waits until the record is durable.
             tokio::select! {
-                _ = end.recv() => return Ok(()),
-                Some(input) = received.recv() => self.take(input).await?,
-                () = crate::driver::sleep_until(self.wake) => self.event(&Event::Tick).await?,
+                biased;
+                _ = end.recv() => return,
+                Some(input) = urgent.recv() => self.take(input),
+                () = crate::driver::sleep_until(self.wake) => self.event(&Event::Tick),
+                waited = self.record.written() => self.written(waited),
                 _ = looks.tick() => {
+                    log.look();
                     if self.agent.is_some() && self.heard.elapsed() > STUCK {
                         tracing::warn!("the agent says nothing");
                         // Its connection ends with its way back; it comes again when it can.
                         self.agent = None;
-                        self.event(&Event::AgentGone).await?;
+                        self.event(&Event::AgentGone);
                     }
                 }
+                Some(input) = calls.recv(), if self.record.is_idle() => self.take(input),
             }
         }
     }
 
-    async fn take(&mut self, input: Input) -> Result<(), GateError> {
+    fn take(&mut self, input: Input) {
         match input {
             Input::Opened { conn, token, back, admit } => {
-                let Some(task) = self.seats.get(&token).cloned() else { return Ok(()) };
+                let Some(task) = self.seats.get(&token).cloned() else { return };
+                if admit.send(()).is_err() {
+                    return;
+                }
                 let registered =
                     proto::Registered { group: DEFAULT_GROUP.to_owned(), task: task.to_string() };
                 let event = proto::event::Event::Registered(registered);
                 let _ = back.try_send(proto::Event { event: Some(event) });
                 self.conns.insert(conn, (task.clone(), back));
-                let _ = admit.send(());
-                self.event(&Event::Opened(conn, task)).await
+                self.event(&Event::Opened(conn, task));
             }
-            Input::Call(conn, call) => self.call(conn, call).await,
-            Input::Closed(conn) => {
-                self.conns.remove(&conn);
-                self.event(&Event::Closed(conn)).await
-            }
+            Input::Call(conn, call) => self.call(conn, call),
+            Input::Closed(conn) => self.put_out(conn),
             Input::AgentCame(life, back) => {
                 // What an earlier one wanted is not what this one waits for.
-                (self.wanted, self.heard) = (0, Instant::now());
+                (self.asked, self.wanted, self.heard) = (0, 0, Instant::now());
                 self.agent = Some((life, Some(back)));
-                Ok(())
             }
-            Input::Wanted(life, wanted) => self.wanted(life, &wanted).await,
+            Input::Wanted(life, wanted) => self.wanted(life, &wanted),
             Input::AgentGone(life) => {
-                if self.agent.take_if(|(newest, _)| *newest == life).is_none() {
-                    return Ok(());
+                if self.agent.take_if(|(newest, _)| *newest == life).is_some() {
+                    tracing::info!("the agent is gone");
+                    self.event(&Event::AgentGone);
                 }
-                tracing::info!("the agent is gone");
-                self.event(&Event::AgentGone).await
             }
             Input::DriverBack(at) => {
                 self.missing[at] = None;
-                self.event(&Event::DriverBack).await?;
+                self.event(&Event::DriverBack);
                 self.tell_agent();
-                Ok(())
             }
+            Input::DriverStands => self.tell_agent(),
             Input::DriverGone(at, why) => {
                 if self.missing[at].as_ref() != Some(&why) {
                     tracing::warn!(driver = at, why, "a driver is not there");
                     self.missing[at] = Some(why);
                     self.tell_agent();
                 }
-                Ok(())
             }
-            Input::Hook(name, tier) => self.event(&Event::EStop(Source::Local(name), tier)).await,
+            Input::Hook(name, tier) => self.event(&Event::EStop(Source::Local(name), tier)),
         }
     }
 
-    async fn call(&mut self, conn: Conn, call: Said) -> Result<(), GateError> {
+    fn call(&mut self, conn: Conn, call: Said) {
         // It was put out, and what it says was under way.
         if !self.conns.contains_key(&conn) {
-            return Ok(());
+            return;
         }
         match call {
-            Said::Register(_) => self.put_out(conn).await,
-            Said::Retain(_) => self.event(&Event::Retain(conn)).await,
+            Said::Register(_) => self.put_out(conn),
+            Said::Retain(_) => self.event(&Event::Retain(conn)),
             Said::Command(command) => {
-                let verdict = self.command(conn, &command).await?;
-                self.answer(conn, command.id, verdict).await
+                let drives = |driver: &Driver| {
+                    driver.settings.actuators.iter().any(|a| a.to_string() == command.actuator)
+                };
+                let driver = self.drivers.iter().position(drives);
+                let token = token(command.lease.as_ref());
+                let proto::Command { id, actuator, data, .. } = command;
+                let command = Some(Command { driver, actuator, data });
+                let event = token.map(|token| Event::Command(conn, token));
+                self.answered(event, About { conn, id, command });
             }
             Said::Delegate(delegate) => {
-                let Some(token) = token(delegate.lease.as_ref()) else {
-                    return self.answer(conn, delegate.id, proto::Verdict::NotHolder).await;
-                };
-                let event = Event::Delegate(conn, token, TaskUid::new(delegate.task));
-                let response = self.core.handle(&event, clock::boot());
-                let verdict = self.carry_out(response, None).await?;
-                self.answer(conn, delegate.id, verdict).await
+                let about = About { conn, id: delegate.id, command: None };
+                let event = |token| Event::Delegate(conn, token, TaskUid::new(delegate.task));
+                self.answered(token(delegate.lease.as_ref()).map(event), about);
             }
         }
     }
 
-    async fn command(
-        &mut self,
-        conn: Conn,
-        command: &proto::Command,
-    ) -> Result<proto::Verdict, GateError> {
-        let Some(token) = token(command.lease.as_ref()) else {
-            return Ok(proto::Verdict::NotHolder);
-        };
-        let drives = |driver: &Driver| {
-            driver.settings.actuators.iter().any(|a| a.to_string() == command.actuator)
-        };
-        let driver = self.drivers.iter().position(drives);
-        let response = self.core.handle(&Event::Command(conn, token), clock::boot());
-        self.carry_out(response, driver.map(|at| (at, &command.data))).await
+    /// Carries out an event that is answered; none: its lease is nobody's.
+    fn answered(&mut self, event: Option<Event>, about: About) {
+        match event {
+            Some(event) => {
+                let response = self.core.handle(&event, clock::boot());
+                self.carry_out(response, Some(about));
+            }
+            None => self.answer(about.conn, about.id, proto::Verdict::NotHolder),
+        }
     }
 
-    async fn event(&mut self, event: &Event) -> Result<(), GateError> {
+    fn event(&mut self, event: &Event) {
         let response = self.core.handle(event, clock::boot());
-        self.carry_out(response, None).await.map(drop)
+        self.carry_out(response, None);
     }
 
-    /// Carries out what the core says, in order; `command` is what [`Effect::Forward`] forwards. Returns what is to be answered.
-    async fn carry_out(
-        &mut self,
-        response: Response,
-        command: Option<(usize, &Bytes)>,
-    ) -> Result<proto::Verdict, GateError> {
-        let (mut taken, mut verdict) = (false, proto::Verdict::Unspecified);
-        let mut tell = false;
+    /// Carries out what the core says, in order; `about` is what [`Effect::Forward`] forwards and [`Effect::Answer`] answers.
+    fn carry_out(&mut self, response: Response, about: Option<About>) {
+        let (mut forward, mut said, mut tell) = (false, None, false);
         for effect in response.effects {
             match effect {
-                // A gate that cannot remember does not go on: it ends with a stop, and another one begins with one.
-                Effect::Keep(kept) => {
-                    // What was told to the drivers goes out before the disk is waited for.
-                    tokio::task::yield_now().await;
-                    durable::write_json(&self.dir.join(KEPT), &kept, Keep::PowerCut)?;
-                }
+                Effect::Keep(kept) => self.record.keep(kept),
                 Effect::Stop(why) => self.stop(why),
                 Effect::Hold => self.drivers.iter().for_each(Driver::hold),
                 Effect::Cut => self.drivers.iter().for_each(Driver::cut),
-                Effect::Forward => {
-                    taken = command.is_some_and(|(at, data)| {
-                        data.len() <= LONGEST && self.drivers[at].command(data)
-                    });
-                }
-                Effect::Answer(Verdict::Ok) if command.is_some() && !taken => {
-                    verdict = proto::Verdict::NoDriver;
-                }
-                Effect::Answer(said) => verdict = wire(said),
+                Effect::Forward => forward = true,
+                Effect::Answer(verdict) => said = Some(verdict),
                 Effect::Silent => (self.silent, tell) = (self.silent + 1, true),
                 Effect::GiveBack(grant) => (self.gives_back, tell) = (Some(grant), true),
                 Effect::Report => tell = true,
@@ -283,23 +309,66 @@ impl Hall {
         self.wake = response.wake;
         let cut = self.core.estop().tier() == Tier::Cut;
         self.drivers.iter().for_each(|driver| driver.keep_off(cut));
+        if let (Some(about), Some(verdict)) = (about, said) {
+            let waits = Waits { about, verdict, forward, stops: self.stops };
+            match self.record.is_idle() {
+                true => self.finish(waits),
+                false => self.record.wait(waits),
+            }
+        }
         if tell {
             self.tell_agent();
         }
-        Ok(verdict)
     }
 
-    fn stop(&self, why: StopReason) {
+    /// Hands a command to its driver, and answers. One that waited while the robot was stopped comes too late.
+    fn finish(&mut self, waits: Waits) {
+        let Waits { about, verdict, forward, stops } = waits;
+        let late = stops != self.stops;
+        let taken = about.command.filter(|_| forward && !late).is_some_and(|command| {
+            command.data.len() <= LONGEST
+                && command
+                    .driver
+                    .is_some_and(|at| self.drivers[at].command(&command.actuator, &command.data))
+        });
+        let verdict = match wire(verdict) {
+            proto::Verdict::Ok if forward && !taken => match self.core.estop().tier() {
+                Tier::None => proto::Verdict::NoDriver,
+                Tier::Settle | Tier::Cut => proto::Verdict::Stopped,
+            },
+            verdict => verdict,
+        };
+        self.answer(about.conn, about.id, verdict);
+    }
+
+    /// The record is durable, or could not be written.
+    fn written(&mut self, waited: Vec<Waits>) {
+        for waits in waited {
+            self.finish(waits);
+        }
+        if self.record.is_idle() {
+            self.wanted = self.asked;
+        }
+        self.tell_agent();
+    }
+
+    fn stop(&mut self, why: StopReason) {
         tracing::info!(%why, "stop");
+        self.stops += 1;
         self.drivers.iter().for_each(Driver::stop);
     }
 
-    /// Takes the agent's word: seats first, so that whoever lost his cannot go on in the grant's place.
-    async fn wanted(&mut self, life: u64, wanted: &proto::Wanted) -> Result<(), GateError> {
+    /// Takes the agent's word. A stop first; then seats, so that whoever lost his cannot go on in the grant's place.
+    fn wanted(&mut self, life: u64, wanted: &proto::Wanted) {
         if self.agent.as_ref().is_none_or(|(newest, _)| *newest != life) {
-            return Ok(());
+            return;
         }
         self.heard = Instant::now();
+        if let Some(estop) = wanted.estop {
+            let tier = Tier::from_number(estop);
+            self.event(&Event::EStop(Source::Controller, tier));
+        }
+        self.event(&Event::Release(wanted.release));
         let seats = wanted.seats.iter();
         self.seats = seats.map(|s| (s.token.clone(), TaskUid::new(s.task.clone()))).collect();
         let seated = |task: &TaskUid| wanted.seats.iter().any(|seat| seat.task == task.as_str());
@@ -310,7 +379,7 @@ impl Hall {
             .map(|(conn, _)| *conn)
             .collect();
         for conn in gone {
-            self.put_out(conn).await?;
+            self.put_out(conn);
         }
         let grant = wanted.grant.as_ref();
         let grant =
@@ -318,36 +387,24 @@ impl Hall {
         if self.gives_back.is_some() && self.gives_back != grant {
             self.gives_back = None;
         }
-        self.event(&Event::Granted(grant)).await?;
-        if let Some(estop) = wanted.estop {
-            let tier = match estop {
-                0 => Tier::None,
-                1 => Tier::Settle,
-                _ => Tier::Cut,
-            };
-            self.event(&Event::EStop(Source::Controller, tier)).await?;
-        }
-        self.event(&Event::Release(wanted.release)).await?;
+        self.event(&Event::Granted(grant));
         if wanted.leaves_for_ms > 0 {
-            self.event(&Event::AgentLeaves { back_within_ms: wanted.leaves_for_ms.into() }).await?;
+            self.event(&Event::AgentLeaves { back_within_ms: wanted.leaves_for_ms.into() });
         }
-        self.wanted = wanted.id;
+        self.asked = wanted.id;
+        if self.record.is_idle() {
+            self.wanted = wanted.id;
+        }
         self.tell_agent();
-        Ok(())
     }
 
-    async fn put_out(&mut self, conn: Conn) -> Result<(), GateError> {
+    fn put_out(&mut self, conn: Conn) {
         // Its way back goes, and with it the connection.
         self.conns.remove(&conn);
-        self.event(&Event::Closed(conn)).await
+        self.event(&Event::Closed(conn));
     }
 
-    async fn answer(
-        &mut self,
-        conn: Conn,
-        id: u64,
-        verdict: proto::Verdict,
-    ) -> Result<(), GateError> {
+    fn answer(&mut self, conn: Conn, id: u64, verdict: proto::Verdict) {
         let answer = proto::Answer {
             id,
             verdict: verdict.into(),
@@ -355,8 +412,9 @@ impl Hall {
             newest: Some(lease(self.core.newest())),
         };
         let event = proto::Event { event: Some(proto::event::Event::Answer(answer)) };
-        let full = self.conns.get(&conn).is_some_and(|(_, back)| back.try_send(event).is_err());
-        if full { self.put_out(conn).await } else { Ok(()) }
+        if self.conns.get(&conn).is_some_and(|(_, back)| back.try_send(event).is_err()) {
+            self.put_out(conn);
+        }
     }
 
     /// How things stand. An agent that does not read is put out: it comes again, and hears everything.
@@ -365,18 +423,27 @@ impl Hall {
         let estop = self.core.estop();
         let demand = |(source, tier): (&Source, Tier)| proto::Demand {
             source: source.to_string(),
-            tier: tier as u32,
+            tier: tier.number(),
         };
-        let driver = |(driver, missing): (&Driver, &Option<String>)| proto::Driver {
-            actuators: driver.settings.actuators.iter().map(ToString::to_string).collect(),
-            error: missing.clone().unwrap_or_default(),
+        // A robot is known to stand when its drivers have read that it must.
+        let unread = |driver: &Driver| {
+            let unread = estop.tier() > Tier::None && !driver.stands();
+            unread.then(|| "it has not read its stop yet".to_owned())
+        };
+        let record = self.record.error().map(|error| format!("the gate's record: {error}"));
+        let driver = |(driver, missing): (&Driver, &Option<String>)| {
+            let error = missing.clone().or_else(|| unread(driver)).or_else(|| record.clone());
+            proto::Driver {
+                actuators: driver.settings.actuators.iter().map(ToString::to_string).collect(),
+                error: error.unwrap_or_default(),
+            }
         };
         let status = proto::Status {
             wanted: self.wanted,
             holder: self.core.holder().map(holder),
             newest: Some(lease(self.core.newest())),
             estop: Some(proto::EStop {
-                tier: estop.tier() as u32,
+                tier: estop.tier().number(),
                 number: estop.number(),
                 demands: estop.demands().map(demand).collect(),
             }),
@@ -414,5 +481,169 @@ fn wire(verdict: Verdict) -> proto::Verdict {
         Verdict::NotHolder => proto::Verdict::NotHolder,
         Verdict::Unknown => proto::Verdict::Unknown,
         Verdict::Stopped => proto::Verdict::Stopped,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use muster_agent_core::gate::{Action, Kept, Settings, Step};
+    use tokio::io::{AsyncBufReadExt as _, BufReader, Lines};
+    use tokio::net::{UnixListener, UnixStream};
+    use tokio::sync::Mutex;
+    use tokio::sync::oneshot::Receiver;
+
+    use super::*;
+    use crate::gate::record::Write;
+
+    const HOLDER: Conn = Conn(1);
+
+    /// A hall whose disk takes its time, with a driver that the test reads.
+    struct Scene {
+        urgent: mpsc::Sender<Input>,
+        calls: mpsc::Sender<Input>,
+        driver: Lines<BufReader<UnixStream>>,
+        answers: mpsc::Receiver<proto::Event>,
+        /// Held: nothing is written.
+        disk: Arc<Mutex<()>>,
+        _dir: tempfile::TempDir,
+    }
+
+    fn wanted(epoch: u64) -> Input {
+        let seat = proto::Seat { task: "a".to_owned(), token: "key".to_owned() };
+        let grant = Some(proto::Holder { task: "a".to_owned(), epoch });
+        Input::Wanted(
+            1,
+            proto::Wanted { id: epoch, seats: vec![seat], grant, ..Default::default() },
+        )
+    }
+
+    fn command(id: u64, lease: &[u32], data: &'static str) -> Input {
+        let lease = Some(proto::Lease { epoch: 6, sequence: lease.to_vec() });
+        let data = Bytes::from_static(data.as_bytes());
+        let actuator = "base:Drive".to_owned();
+        Input::Call(HOLDER, Said::Command(proto::Command { id, lease, actuator, data }))
+    }
+
+    impl Scene {
+        async fn start(steps: &[Step]) -> Scene {
+            let dir = tempfile::tempdir().unwrap();
+            let path = dir.path().join("driver");
+            let listener = UnixListener::bind(&path).unwrap();
+            let settings =
+                serde_json::json!({"actuators": ["base:Drive"], "unix": path, "stop": "stop"});
+            let (urgent, mut urgently) = mpsc::channel(INPUTS);
+            let (calls, mut called) = mpsc::channel(INPUTS);
+            let driver =
+                Driver::start(0, serde_json::from_value(settings).unwrap(), urgent.clone());
+            let disk = Arc::new(Mutex::new(()));
+            let held = Arc::clone(&disk);
+            let write: Write = Arc::new(move |_| {
+                drop(held.blocking_lock());
+                Ok(())
+            });
+            let core = Settings { ladder: steps.to_vec(), ..Settings::default() };
+            let (core, first) = Gate::start(core, Kept::default());
+            let dir_of = dir.path().to_owned();
+            let mut hall =
+                Hall::new(dir_of, String::new(), (core, vec![driver]), Record::new(write));
+            let mut end = signal(SignalKind::user_defined1()).unwrap();
+            tokio::spawn(async move {
+                hall.run(first, (&mut urgently, &mut called), &mut end).await;
+            });
+            let (stream, _) = listener.accept().await.unwrap();
+            let (back, answers) = mpsc::channel(8);
+            let (agent, _status) = mpsc::channel(64);
+            let (admit, admitted): (_, Receiver<()>) = oneshot::channel();
+            urgent.send(Input::AgentCame(1, agent)).await.unwrap();
+            urgent.send(wanted(6)).await.unwrap();
+            let opened = Input::Opened { conn: HOLDER, token: "key".to_owned(), back, admit };
+            calls.send(opened).await.unwrap();
+            admitted.await.unwrap();
+            let driver = BufReader::new(stream).lines();
+            let mut scene = Scene { urgent, calls, driver, answers, disk, _dir: dir };
+            assert!(scene.answers.recv().await.is_some(), "it is registered");
+            scene.say(command(1, &[], "go")).await;
+            assert_eq!(scene.answer().await, (1, proto::Verdict::Ok));
+            scene.hears("go").await;
+            scene
+        }
+
+        async fn say(&self, input: Input) {
+            self.calls.send(input).await.unwrap();
+        }
+
+        async fn answer(&mut self) -> (u64, proto::Verdict) {
+            match self.answers.recv().await.and_then(|event| event.event) {
+                Some(proto::event::Event::Answer(answer)) => (answer.id, answer.verdict()),
+                other => panic!("{other:?}"),
+            }
+        }
+
+        /// Until the driver hears that, after nothing but stops.
+        async fn hears(&mut self, word: &str) {
+            loop {
+                let heard = self.driver.next_line().await.unwrap().unwrap();
+                if heard == word {
+                    return;
+                }
+                assert_eq!(heard, "stop");
+            }
+        }
+    }
+
+    const PATIENT: &[Step] = &[Step { after_ms: 300_000, action: Action::Stop }];
+
+    #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+    async fn a_button_does_not_wait_for_the_disk() {
+        let mut scene = Scene::start(PATIENT).await;
+        let disk = Arc::clone(&scene.disk);
+        let held = disk.lock().await;
+        // A newer token is to be durable before it counts.
+        scene.say(command(2, &[1], "go on")).await;
+        scene.say(command(3, &[1], "go on")).await;
+        scene.urgent.send(Input::Hook("button".to_owned(), Tier::Settle)).await.unwrap();
+        scene.hears("stop").await;
+        drop(held);
+        assert_eq!(scene.answer().await, (2, proto::Verdict::Stopped));
+        assert_eq!(scene.answer().await, (3, proto::Verdict::Stopped));
+        drop(scene.urgent);
+        drop(scene.calls);
+    }
+
+    #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+    async fn nor_does_a_stop_for_a_holder_that_is_gone_or_silent() {
+        let silent = &[Step { after_ms: 100, action: Action::Stop }];
+        for steps in [PATIENT, silent] {
+            let mut scene = Scene::start(steps).await;
+            let disk = Arc::clone(&scene.disk);
+            let held = disk.lock().await;
+            scene.say(command(2, &[1], "go on")).await;
+            if steps == PATIENT {
+                // It is heard before what the holder had still said, and before what the disk is to take.
+                scene.urgent.send(Input::Closed(HOLDER)).await.unwrap();
+            }
+            scene.hears("stop").await;
+            drop(held);
+        }
+    }
+
+    #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+    async fn a_task_that_says_much_is_not_before_a_button() {
+        let mut scene = Scene::start(PATIENT).await;
+        let talks = scene.calls.clone();
+        let talker = tokio::spawn(async move {
+            let said =
+                std::iter::repeat_with(|| Input::Call(HOLDER, Said::Retain(proto::Retain {})));
+            for input in said {
+                if talks.send(input).await.is_err() {
+                    return;
+                }
+            }
+        });
+        scene.urgent.send(Input::Hook("button".to_owned(), Tier::Settle)).await.unwrap();
+        scene.hears("stop").await;
+        talker.abort();
     }
 }

@@ -19,10 +19,9 @@ use muster_api::name::FunctionName;
 use muster_api::wire::gate::v1 as proto;
 use tokio::net::UnixStream;
 use tokio::sync::watch;
-use tokio::time::Instant;
 
 use super::settings::{self, Settings};
-use super::{AGENT_SOCKET, TASKS_DIR, VERB};
+use super::{AGENT_SOCKET, LOG, TASKS_DIR, VERB};
 use crate::driver::chain;
 use crate::durable::{self, FileError, Keep};
 use crate::executor::frame;
@@ -34,7 +33,7 @@ const AGAIN: Duration = Duration::from_millis(20);
 /// The agent says what it wants at least so often; see `hall`'s `STUCK`.
 const SAY_EVERY: Duration = Duration::from_secs(1);
 
-/// Between two starts of a gate that ends at once.
+/// Between two starts of a gate that ends before it can be asked anything.
 const START_AGAIN: Duration = Duration::from_millis(200);
 
 /// An agent that goes down in order is back within this, or the robot is stopped: the time of an upgrade.
@@ -121,6 +120,11 @@ impl Standing {
             ),
             None => Condition::new(ACTUATORS_FENCED, true, "Gate", String::new()),
         }
+    }
+
+    /// The task whose right to drive is given back.
+    pub(crate) fn gives_back(&self) -> Option<TaskUid> {
+        self.status.as_ref()?.gives_back.as_ref().map(|holder| TaskUid::new(holder.task.clone()))
     }
 
     /// What stops the robot.
@@ -221,27 +225,29 @@ impl Keeper {
 
     /// Keeps a gate until dropped; the gate stays.
     pub(crate) async fn run(self: Arc<Keeper>) {
-        let mut child: Option<(Child, Instant)> = None;
+        let mut child: Option<Child> = None;
+        let mut served = false;
         loop {
             // A gate that has ended must not stay a zombie. One that ran is started again at once: the robot stands only when
             // the next one has said so.
-            if let Some((gate, started)) = &mut child
+            if let Some(gate) = &mut child
                 && matches!(gate.try_wait(), Ok(Some(_)))
             {
-                if started.elapsed() < START_AGAIN {
+                if !std::mem::take(&mut served) {
                     tokio::time::sleep(START_AGAIN).await;
                 }
                 child = None;
             }
             match UnixStream::connect(self.dir.join(AGENT_SOCKET)).await {
                 Ok(stream) => {
+                    served = true;
                     let ended = self.talk(stream).await;
                     self.standing.send_replace(Standing::default());
                     let error = ended.err().map(|error| chain(&error));
                     tracing::warn!(error, "the gate is gone: the robot stands");
                 }
                 Err(_) if child.is_none() => match self.start() {
-                    Ok(started) => child = Some((started, Instant::now())),
+                    Ok(started) => child = Some(started),
                     Err(error) => {
                         tracing::error!(error = chain(&error), "the gate does not start");
                         tokio::time::sleep(START_AGAIN).await;
@@ -260,7 +266,7 @@ impl Keeper {
         let made = fs::DirBuilder::new().recursive(true).mode(0o711).create(&tasks);
         made.map_err(FileError::at("make", &tasks))?;
         durable::write_json(&dir.join(settings::FILE), &self.settings, Keep::Crash)?;
-        let path = dir.join("log");
+        let path = dir.join(LOG);
         let log = File::options().create(true).append(true).open(&path);
         let log = log.map_err(FileError::at("open", &path))?;
         let mut command = Command::new(&self.program);

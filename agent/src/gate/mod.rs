@@ -15,6 +15,8 @@
 //! | `door` | gate | sockets of tasks and of the agent |
 //! | `driver` | gate | one driver, and what waits for it |
 //! | `hook` | gate | files and pins that stop the robot |
+//! | `record` | gate | what must be durable, and what waits for that |
+//! | `log` | gate | its log, bounded |
 //! | `keeper` | agent | keeps a gate alive, tells it what the controller grants, and hears how it stands |
 //!
 //! It is a hidden verb of the agent's binary, `… gate DIR`: one event loop, one thread. In DIR:
@@ -26,13 +28,15 @@
 //! | `kept.json` | gate | the newest token, and what stops the robot; durable before it counts |
 //! | `agent` | gate | the agent's socket, nobody else's |
 //! | `tasks/socket` | gate | the tasks' socket, in a directory of its own that containers see |
-//! | `log` | gate | what it has to say |
+//! | `log`, `log.1` | gate, drivers | what they have to say; the older part of it |
 
-mod door;
+pub(crate) mod door;
 mod driver;
 mod hall;
 mod hook;
 pub(crate) mod keeper;
+mod log;
+mod record;
 pub(crate) mod settings;
 
 use std::ffi::OsString;
@@ -55,6 +59,8 @@ pub(crate) const DIR: &str = "gate";
 pub(crate) const TASKS_DIR: &str = "tasks";
 /// The tasks' socket in that.
 pub(crate) const SOCKET: &str = "socket";
+/// What it and its drivers say.
+const LOG: &str = "log";
 /// The agent's socket in it.
 const AGENT_SOCKET: &str = "agent";
 /// Where a task finds the gate.
@@ -106,7 +112,8 @@ fn run(args: impl IntoIterator<Item = OsString>) -> Result<(), GateError> {
     let settings: Settings = durable::read_json(&path)?.ok_or(GateError::NoSettings(path))?;
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()
-        .max_blocking_threads(1)
+        // The record's and the log's.
+        .max_blocking_threads(2)
         .build()
         .map_err(|source| GateError::System { what: "start", source })?;
     runtime.block_on(hall::serve(dir, settings))

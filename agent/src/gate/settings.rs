@@ -4,9 +4,9 @@
 //! gate:
 //!   drivers:
 //!     - actuators: ["base:Drive"]
-//!       exec: [/usr/lib/robot/base-driver]     # or unix: /run/robot/base.sock
+//!       exec: [/usr/lib/robot/base-driver]     # or unix: /run/robot/base.sock; or sim: Base, with nothing beside
 //!       stop: '{"linear": 0, "angular": 0}'
-//!   ladder: [{after: 100ms, action: Log}, {after: 200ms, action: Stop}]
+//!   ladder: [{after: 100ms, action: Log}, {after: 200ms, action: Stop}, {after: 30s, action: Release}]
 //!   agentGrace: 0s
 //!   estop:
 //!     - {name: button, gpio: /sys/class/gpio/gpio17/value, activeLow: true}
@@ -20,6 +20,8 @@ use muster_agent_core::gate::{self, Action, Step, Tier};
 use muster_api::duration::Span;
 use muster_api::name::FunctionName;
 use serde::{Deserialize, Serialize};
+
+use crate::sim;
 
 /// The file, in the gate's directory.
 pub(super) const FILE: &str = "settings.json";
@@ -58,10 +60,17 @@ pub(crate) struct Driver {
     /// A Unix socket on which it listens.
     #[serde(default)]
     pub(super) unix: Option<PathBuf>,
+    /// The simulated robot's base.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    sim: Option<Simulated>,
     /// How commands are kept apart.
     #[serde(default)]
     pub(super) framing: Framing,
-    /// The command that stops what it moves.
+    /// What becomes of a command for an actuator while another one for it waits until the driver has read.
+    #[serde(default)]
+    pub(super) waiting: Waiting,
+    /// The command that stops what it moves; the simulator's is known.
+    #[serde(default)]
     pub(super) stop: String,
     /// The command to stay as it is; absent: the stop command.
     #[serde(default)]
@@ -69,6 +78,23 @@ pub(crate) struct Driver {
     /// The command that cuts the power; absent: the driver is ended, or its socket closed.
     #[serde(default)]
     pub(super) cut: Option<String>,
+}
+
+/// A driver of the simulated robot.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+enum Simulated {
+    /// Velocities, `{"linear": m/s, "angular": rad/s}`.
+    Base,
+}
+
+/// What becomes of a command while another one waits.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub(super) enum Waiting {
+    /// It takes the other one's place: for velocities and positions, of which only the newest counts.
+    #[default]
+    Newest,
+    /// It is answered NO_DRIVER: for a driver of which each command counts.
+    Each,
 }
 
 /// How commands are kept apart.
@@ -109,8 +135,14 @@ fn cut() -> Tier {
 /// Why settings make no sense.
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum SettingsError {
-    #[error("drivers[{0}]: give exactly one of exec and unix")]
+    #[error("drivers[{0}]: give exactly one of exec, unix and sim")]
     Way(usize),
+    #[error("drivers[{0}].stop: say the command that stops what it moves")]
+    NoStopCommand(usize),
+    #[error("drivers[{0}].{1}: the simulator's is known; leave it out")]
+    Known(usize, &'static str),
+    #[error("drivers[{0}].sim: this robot is not simulated; its position would be sim:world.yaml")]
+    NotSimulated(usize),
     #[error("drivers[{0}].actuators: name what it moves, as in [\"base:Drive\"]")]
     NoActuators(usize),
     #[error(
@@ -127,10 +159,8 @@ pub(crate) enum SettingsError {
     NoStop,
     #[error("ladder[{0}]: Hold comes before Stop")]
     HoldAfterStop(usize),
-    #[error(
-        "ladder[{0}]: Release is not served: nobody ends the task of a silent holder; leave it out"
-    )]
-    Release(usize),
+    #[error("ladder[{0}]: Release comes after Stop; the robot would go on with nobody's right")]
+    ReleaseBeforeStop(usize),
     #[error("estop[{0}]: give exactly one of file and gpio")]
     HookWay(usize),
     #[error("estop[{at}].name: {name:?} is taken, or empty; each needs a name of its own")]
@@ -145,13 +175,23 @@ impl Settings {
         self.drivers.is_empty()
     }
 
+    /// Puts the socket of the simulator in `dir` in the place of the drivers that are simulated.
+    pub(crate) fn simulate(mut self, dir: Option<&Path>) -> Result<Settings, SettingsError> {
+        for (at, driver) in self.drivers.iter_mut().enumerate() {
+            if driver.sim.take().is_some() {
+                let dir = dir.ok_or(SettingsError::NotSimulated(at))?;
+                driver.unix = Some(dir.join(sim::DRIVE));
+                sim::STOP.clone_into(&mut driver.stop);
+            }
+        }
+        Ok(self)
+    }
+
     /// Says what makes no sense.
     pub(crate) fn check(&self, actuators: &BTreeSet<FunctionName>) -> Result<(), SettingsError> {
         let mut driven = BTreeSet::new();
         for (at, driver) in self.drivers.iter().enumerate() {
-            if driver.exec.is_empty() == driver.unix.is_none() {
-                return Err(SettingsError::Way(at));
-            }
+            driver.check_way(at)?;
             if driver.actuators.is_empty() {
                 return Err(SettingsError::NoActuators(at));
             }
@@ -189,9 +229,11 @@ impl Settings {
         let stop = stop.ok_or(SettingsError::NoStop)?;
         for (at, rung) in rungs.iter().enumerate() {
             match rung.action {
-                Action::Release => return Err(SettingsError::Release(at)),
+                Action::Release if rung.after < stop => {
+                    return Err(SettingsError::ReleaseBeforeStop(at));
+                }
                 Action::Hold if rung.after >= stop => return Err(SettingsError::HoldAfterStop(at)),
-                Action::Hold | Action::Log | Action::Stop => {}
+                Action::Hold | Action::Log | Action::Stop | Action::Release => {}
             }
         }
         Ok(())
@@ -212,6 +254,24 @@ impl Settings {
 }
 
 impl Driver {
+    fn check_way(&self, at: usize) -> Result<(), SettingsError> {
+        let ways = [!self.exec.is_empty(), self.unix.is_some(), self.sim.is_some()];
+        if ways.into_iter().filter(|given| *given).count() != 1 {
+            return Err(SettingsError::Way(at));
+        }
+        let known = [
+            ("stop", !self.stop.is_empty()),
+            ("hold", self.hold.is_some()),
+            ("cut", self.cut.is_some()),
+            ("framing", self.framing != Framing::default()),
+        ];
+        match (self.sim, known.into_iter().find(|(_, given)| *given)) {
+            (Some(_), Some((field, _))) => Err(SettingsError::Known(at, field)),
+            (None, _) if self.stop.is_empty() => Err(SettingsError::NoStopCommand(at)),
+            _ => Ok(()),
+        }
+    }
+
     fn check_lines(&self, at: usize) -> Result<(), SettingsError> {
         let commands =
             [("stop", Some(&self.stop)), ("hold", self.hold.as_ref()), ("cut", self.cut.as_ref())];
@@ -266,6 +326,11 @@ mod tests {
     fn what_makes_no_sense_is_named() {
         let cases = [
             ("drivers: [{actuators: ['base:Drive'], stop: s}]", "drivers[0]: give exactly one"),
+            ("drivers: [{actuators: ['base:Drive'], exec: [a]}]", "drivers[0].stop: say"),
+            (
+                "drivers: [{actuators: ['base:Drive'], sim: Base, stop: s}]",
+                "drivers[0].stop: the sim",
+            ),
             ("drivers: [{actuators: [], exec: [a], stop: s}]", "drivers[0].actuators: name what"),
             ("drivers: [{actuators: ['leg:Kick'], exec: [a], stop: s}]", "add it to --ar-res"),
             (
@@ -279,7 +344,7 @@ mod tests {
             ("ladder: []", "no Stop"),
             ("ladder: [{after: 1s, action: Stop}, {after: 2s, action: Hold}]", "ladder[1]: Hold"),
             (
-                "ladder: [{after: 1s, action: Stop}, {after: 2s, action: Release}]",
+                "ladder: [{after: 1s, action: Stop}, {after: 500ms, action: Release}]",
                 "ladder[1]: Release",
             ),
             ("estop: [{name: a}]", "estop[0]: give exactly one"),

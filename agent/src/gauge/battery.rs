@@ -3,6 +3,7 @@
 //! | source | reads |
 //! |---|---|
 //! | `sysfs:NAME` | the kernel's driver, `/sys/class/power_supply/NAME/{capacity,status}` |
+//! | `sim` | the simulator, where the robot is one (`position: sim:…`); the default there |
 //! | `file:PATH` | a line `PERCENT` or `PERCENT charging` that some program of the robot's keeps up to date |
 //!
 //! A source that cannot be read for half a minute, or says something else, tells nothing: the controller then takes the
@@ -14,7 +15,11 @@ use std::time::Duration;
 
 use muster_api::kind::node::upkeep::Battery;
 
+use tokio::sync::watch;
+
 use super::Gauge;
+use crate::sim::keeper::Simulator;
+use crate::sim::robot::Said;
 
 /// A battery loses a percent in minutes.
 const EVERY: Duration = Duration::from_secs(2);
@@ -28,12 +33,14 @@ pub(crate) enum BatterySource {
     Sysfs(PathBuf),
     /// Some program of the robot's keeps it in a file.
     File(PathBuf),
+    /// The simulator's.
+    Sim,
 }
 
 /// Why a text names no source.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub(crate) enum BatterySourceError {
-    #[error("{0:?} names no battery; write sysfs:BAT0 or file:/run/robot/battery")]
+    #[error("{0:?} names no battery; write sysfs:BAT0, file:/run/robot/battery or sim")]
     Scheme(String),
     #[error("{0:?} is no name in /sys/class/power_supply; write sysfs:BAT0")]
     Name(String),
@@ -54,17 +61,21 @@ impl FromStr for BatterySource {
             }
             Some(("file", path)) if path.starts_with('/') => Ok(BatterySource::File(path.into())),
             Some(("file", path)) => Err(BatterySourceError::File(path.to_owned())),
+            None if text == "sim" => Ok(BatterySource::Sim),
             _ => Err(BatterySourceError::Scheme(text.to_owned())),
         }
     }
 }
 
 impl BatterySource {
-    /// Starts to read it.
-    pub(crate) fn open(&self) -> BatteryGauge {
+    /// Starts to read it. None: it is a simulator's, and there is none.
+    pub(crate) fn open(&self, simulator: Option<&Simulator>) -> Option<BatteryGauge> {
+        if *self == BatterySource::Sim {
+            return Some(BatteryGauge::Simulated(simulator?.said()));
+        }
         let source = self.clone();
         let read = move |last: Reading| last.then(source.read());
-        BatteryGauge(Gauge::open(EVERY, Reading::default(), read))
+        Some(BatteryGauge::Read(Gauge::open(EVERY, Reading::default(), read)))
     }
 
     fn read(&self) -> Result<Battery, String> {
@@ -77,13 +88,14 @@ impl BatterySource {
                 Ok(Battery { percent: percent(&capacity)?, charging: status.trim() == "Charging" })
             }
             BatterySource::File(path) => parse(&text(path)?),
+            BatterySource::Sim => Err("there is no simulator".to_owned()),
         }
     }
 }
 
 /// What is known of the charge.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
-struct Reading {
+pub(crate) struct Reading {
     charge: Option<Battery>,
     /// How often in a row it could not be read.
     missed: u32,
@@ -125,11 +137,29 @@ fn percent(text: &str) -> Result<u8, String> {
 
 /// Tells the newest charge.
 #[derive(Debug)]
-pub(crate) struct BatteryGauge(Gauge<Reading>);
+pub(crate) enum BatteryGauge {
+    /// Of a source that is read.
+    Read(Gauge<Reading>),
+    /// The simulator says it.
+    Simulated(watch::Receiver<Option<Said>>),
+}
 
 impl BatteryGauge {
     pub(crate) fn charge(&self) -> Option<Battery> {
-        self.0.newest().charge
+        match self {
+            BatteryGauge::Read(gauge) => gauge.newest().charge,
+            BatteryGauge::Simulated(said) => {
+                let said = said.borrow();
+                let said = said.as_ref()?;
+                // Rounded down, as above.
+                #[expect(
+                    clippy::cast_possible_truncation,
+                    clippy::cast_sign_loss,
+                    reason = "0 to 100"
+                )]
+                Some(Battery { percent: said.percent? as u8, charging: said.charging })
+            }
+        }
     }
 }
 
@@ -142,6 +172,7 @@ mod tests {
         let sysfs = BatterySource::Sysfs("/sys/class/power_supply/BAT0".into());
         assert_eq!("sysfs:BAT0".parse(), Ok(sysfs));
         assert_eq!("file:/run/b".parse(), Ok(BatterySource::File("/run/b".into())));
+        assert_eq!("sim".parse(), Ok(BatterySource::Sim));
         for bad in ["sysfs:", "sysfs:../../etc", "file:b", "BAT0", "ros9:/battery"] {
             assert!(bad.parse::<BatterySource>().is_err(), "{bad}");
         }

@@ -13,7 +13,7 @@ use tokio_util::task::AbortOnDropHandle;
 /// The newest reading of something that is read again every so often, on another thread: a file system that hangs later
 /// must not stop the agent.
 #[derive(Debug)]
-struct Gauge<T> {
+pub(crate) struct Gauge<T> {
     newest: watch::Receiver<T>,
     _reader: AbortOnDropHandle<()>,
 }

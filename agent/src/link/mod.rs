@@ -5,11 +5,17 @@
 //! | [`token`] | join tokens |
 //! | [`tls`] | whom the agent believes, and who it says it is |
 //! | [`join`] | from a token to a certificate, once |
+//! | [`dial`] | connections to the controller |
+//! | [`messages`] | messages of executors, on a connection of their own |
+//! | [`orders`] | emergency stops, on a connection of their own |
 //! | [`session`] | one stream per life of the agent, made again whenever it breaks |
 //! | [`report`] | reports in their wire form |
 //! | [`stream_logs`] | a task's output, on request |
 
+pub(crate) mod dial;
 pub(crate) mod join;
+pub(crate) mod messages;
+pub(crate) mod orders;
 pub(crate) mod report;
 pub(crate) mod session;
 pub(crate) mod stream_logs;

@@ -8,7 +8,8 @@ use muster_api::id::TaskUid;
 use muster_api::wire::agent::v1 as proto;
 
 /// A report as the controller gets it.
-pub(crate) fn to_wire(uid: &TaskUid, report: &Report) -> proto::TaskReport {
+#[must_use]
+pub fn to_wire(uid: &TaskUid, report: &Report) -> proto::TaskReport {
     let content = &report.content;
     proto::TaskReport {
         uid: uid.to_string(),

@@ -4,32 +4,33 @@
 //! supervisor ◀── Command ── session ──▶ controller
 //! board ──── reports, usage ──▶ │
 //! node  ──── state, pose ─────▶ │
+//! desks ◀─── messages ─────── messages ─▶ controller (a connection of their own)
 //! ```
 //!
 //! Level-triggered: a Hello carries every report and the whole node; what was sent in a session is
 //! sent again until it is acknowledged. Losing a session loses nothing but time.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::net::{IpAddr, SocketAddr};
-use std::sync::{Arc, OnceLock};
+use std::net::IpAddr;
+use std::sync::Arc;
 use std::time::Duration;
 
-use hyper_util::rt::TokioIo;
+use muster_agent_core::journal::Journal;
 use muster_agent_core::time::Boot;
 use muster_api::id::TaskUid;
 use muster_api::wire::agent::v1 as proto;
-use muster_api::wire::{HTTP2_FRAME, HTTP2_WINDOW};
 use proto::agent_message::Body as Say;
 use proto::controller_message::Body as Hear;
-use rustls::ClientConfig;
 use tokio::sync::{mpsc, watch};
 use tokio::task::{AbortHandle, JoinSet};
 use tokio::time::{Instant, MissedTickBehavior};
 use tokio_stream::wrappers::ReceiverStream;
-use tonic::transport::{Channel, Endpoint};
 
+use super::dial::service::agent_service_client::AgentServiceClient;
+use super::dial::{DEAF_AFTER, DialError, Dialer, PAUSE};
+use super::messages::Messages;
+use super::report;
 use super::stream_logs::stream_logs;
-use super::{Address, report, tls};
 use crate::clock;
 use crate::driver::{Shared, chain};
 use crate::executor::direct::Door;
@@ -37,32 +38,11 @@ use crate::executor::frame::FRAME_MAX;
 use crate::gate::keeper::Standing;
 use crate::node::Node;
 
-/// The client's side of the service.
-mod service {
-    #![allow(
-        clippy::all,
-        clippy::allow_attributes,
-        clippy::allow_attributes_without_reason,
-        missing_debug_implementations,
-        unreachable_pub,
-        reason = "generated"
-    )]
-    include!(concat!(env!("OUT_DIR"), "/muster.agent.v1.rs"));
-}
-use service::agent_service_client::AgentServiceClient;
-
-/// First and longest pause between two tries. The first is short, because a controller that is
-/// started anew is back within seconds; the longest bounds how long a robot is alone for nothing.
-const PAUSE: (Duration, Duration) = (Duration::from_millis(50), Duration::from_secs(5));
-
 /// Messages under way to the controller. Short: whoever has much to say (logs) waits here.
 const QUEUE: usize = 32;
 
-/// A report without an answer is said again after this.
-const SAY_AGAIN: Duration = Duration::from_secs(5);
-
-/// A connection on which nothing was heard for this long is given up.
-const DEAF_AFTER: Duration = Duration::from_secs(10);
+/// A robot that has not heard emergency stops for this long is not connected.
+const UNORDERED: Duration = Duration::from_secs(3);
 
 /// A log request is a reader at a terminal; more than this is a mistake, or an attack.
 const MOST_READERS: usize = 64;
@@ -78,14 +58,16 @@ pub(crate) enum Command {
 /// Why a session ended.
 #[derive(Debug, thiserror::Error)]
 enum SessionError {
-    #[error("failed to connect")]
-    Connect(#[source] tonic::transport::Error),
+    #[error(transparent)]
+    Connect(#[from] DialError),
     #[error("the controller ended the session")]
     Status(#[source] Box<tonic::Status>),
     #[error("the controller closed the session")]
     Closed,
     #[error("the controller's first message was no welcome")]
     NoWelcome,
+    #[error("emergency stops are not heard")]
+    NotOrdered,
     #[error("nothing was heard for {} s", DEAF_AFTER.as_secs())]
     Deaf,
 }
@@ -93,12 +75,13 @@ enum SessionError {
 /// What a session needs.
 #[derive(Debug)]
 pub(crate) struct Link {
-    pub(crate) address: Address,
-    pub(crate) tls: Arc<ClientConfig>,
+    pub(crate) dialer: Dialer,
     /// This life of the agent.
     pub(crate) incarnation: String,
     pub(crate) shared: Arc<Shared>,
     pub(crate) commands: mpsc::Sender<Command>,
+    /// Whether emergency stops are heard; absent: nothing stands before the drivers.
+    pub(crate) ordered: Option<watch::Receiver<bool>>,
 }
 
 pub(crate) fn outgoing(body: Say) -> proto::AgentMessage {
@@ -125,36 +108,36 @@ impl Link {
         }
     }
 
-    /// Also the address by which the controller is reached.
-    async fn channel(&self) -> Result<(Channel, Option<IpAddr>), SessionError> {
-        let endpoint = Endpoint::from_shared(format!("http://{}", self.address))
-            .map_err(SessionError::Connect)?
-            .connect_timeout(DEAF_AFTER)
-            .initial_stream_window_size(HTTP2_WINDOW)
-            .initial_connection_window_size(HTTP2_WINDOW)
-            .max_frame_size(HTTP2_FRAME)
-            .http2_keep_alive_interval(DEAF_AFTER / 2)
-            .keep_alive_timeout(DEAF_AFTER / 2)
-            .keep_alive_while_idle(true);
-        let (address, tls) = (self.address.clone(), Arc::clone(&self.tls));
-        let own = Arc::new(OnceLock::new());
-        let found = Arc::clone(&own);
-        let connector = tower::service_fn(move |_: http::Uri| {
-            let (address, tls, found) = (address.clone(), Arc::clone(&tls), Arc::clone(&found));
-            async move {
-                let stream = tls::connect(&address, tls).await?;
-                // Another one than that of the first connection would be no worse.
-                let _ = found.set(stream.get_ref().0.get_ref().local_addr().ok());
-                Ok::<_, tls::ConnectError>(TokioIo::new(stream))
+    /// A robot that would not hear an emergency stop takes no work.
+    async fn ordered(&self) -> Result<(), SessionError> {
+        let Some(ordered) = &self.ordered else { return Ok(()) };
+        let mut ordered = ordered.clone();
+        let heard = tokio::time::timeout(DEAF_AFTER, ordered.wait_for(|heard| *heard)).await;
+        match heard {
+            Ok(Ok(_)) => Ok(()),
+            Ok(Err(_)) | Err(_) => Err(SessionError::NotOrdered),
+        }
+    }
+
+    /// Returns when emergency stops have not been heard for too long: the controller is not to think that this robot is well.
+    async fn deaf_to_orders(&self) {
+        let Some(ordered) = &self.ordered else { return std::future::pending().await };
+        let mut ordered = ordered.clone();
+        loop {
+            // Closed: the agent goes down.
+            if ordered.wait_for(|heard| !heard).await.is_err() {
+                return;
             }
-        });
-        let channel = endpoint.connect_with_connector(connector).await;
-        let own = own.get().copied().flatten();
-        Ok((channel.map_err(SessionError::Connect)?, own.map(|own: SocketAddr| own.ip())))
+            let heard = tokio::time::timeout(UNORDERED, ordered.wait_for(|heard| *heard)).await;
+            if !matches!(heard, Ok(Ok(_))) {
+                return;
+            }
+        }
     }
 
     async fn session(&self, node: &mut Node, door: &mut Door) -> Result<(), SessionError> {
-        let (channel, own) = self.channel().await?;
+        self.ordered().await?;
+        let (channel, own) = self.dialer.channel().await?;
         let mut client = AgentServiceClient::new(channel)
             .max_decoding_message_size(FRAME_MAX)
             .max_encoding_message_size(FRAME_MAX);
@@ -179,18 +162,16 @@ impl Link {
             Some(_) => return Err(SessionError::NoWelcome),
             None => return Err(SessionError::Closed),
         };
-        tracing::info!(controller = %welcome.controller, address = %self.address, "connected");
+        tracing::info!(controller = %welcome.controller, address = %self.dialer.address, "connected");
         self.shared.contact.made(sent);
         let _ = self.commands.send(Command::Contact).await;
-        let said = reports
-            .into_iter()
-            .map(|(uid, said, _)| (uid.to_string(), (said.sequence, Instant::now())));
+        let said = reports.into_iter().map(|(uid, said, _)| (uid, said.sequence));
         let mut session = Session {
             link: self,
             node,
             door: (door, own),
             out,
-            said: said.collect(),
+            journal: Journal::begun(said, clock::boot()),
             beats: BTreeMap::new(),
             beat: 0,
             readers: JoinSet::new(),
@@ -198,7 +179,14 @@ impl Link {
         };
         let interval =
             Duration::from_millis(welcome.heartbeat_interval_ms.clamp(50, 60_000).into());
-        session.run(&mut heard, interval).await
+        let (told, executors) = watch::channel(None);
+        let messages = Messages { dialer: &self.dialer, desks: &self.shared.desks, told };
+        // None is polled again after another has ended.
+        tokio::select! {
+            ended = session.run(&mut heard, interval, executors) => ended,
+            never = messages.run() => match never {},
+            () = self.deaf_to_orders() => Err(SessionError::NotOrdered),
+        }
     }
 }
 
@@ -220,8 +208,7 @@ struct Session<'a> {
     /// Where frameworks may come, and the address by which the controller is reached.
     door: (&'a mut Door, Option<IpAddr>),
     out: mpsc::Sender<proto::AgentMessage>,
-    /// By task: the newest sequence said in this session, and when.
-    said: BTreeMap<String, (u64, Instant)>,
+    journal: Journal,
     /// When heartbeats without an answer were sent.
     beats: BTreeMap<u64, Boot>,
     beat: u64,
@@ -234,13 +221,12 @@ impl Session<'_> {
         &mut self,
         heard: &mut tonic::Streaming<proto::ControllerMessage>,
         interval: Duration,
+        mut executors: watch::Receiver<Option<BTreeSet<TaskUid>>>,
     ) -> Result<(), SessionError> {
         let mut beats = tokio::time::interval(interval);
         beats.set_missed_tick_behavior(MissedTickBehavior::Delay);
         let shared = Arc::clone(&self.link.shared);
-        let mut executors = shared.desks.executors();
         let mut gate = shared.gate.as_ref().map(|gate| gate.standing());
-        self.say_executors(&mut executors).await?;
         let mut last_heard = Instant::now();
         loop {
             // Every arm is cancel-safe: a stream's next message stays in the stream, a permit that
@@ -255,12 +241,8 @@ impl Session<'_> {
                         None => return Err(SessionError::Closed),
                     }
                 }
-                message = shared.desks.said() => {
-                    // At most once: with the session goes what was under way.
-                    self.say(Say::Message(message)).await?;
-                }
                 () = shared.board.changed() => self.say_reports().await?,
-                // Closed: the desks end with the agent.
+                // Closed: the messages' side has ended, and the session with it.
                 Ok(()) = executors.changed() => self.say_executors(&mut executors).await?,
                 () = changed(&mut gate) => {
                     // A stop is told at once; whoever ordered it waits for that.
@@ -302,14 +284,12 @@ impl Session<'_> {
                 self.link.shared.board.acknowledged(&answer.uid, answer.sequence);
             }
             Hear::Log(request) => self.start_reader(request).await,
-            Hear::Order(order) => match &self.link.shared.gate {
-                Some(gate) => gate.demand(order.estop_tier, order.estop_release),
-                None if order.estop_tier > 0 => {
-                    tracing::error!("an emergency stop, and no gate stands before the drivers");
-                }
-                None => {}
-            },
-            Hear::Message(message) => self.link.shared.desks.hear(message),
+            Hear::Images(images) => self.link.shared.images.want(&images),
+            Hear::Exec(order) => {
+                let shared = &self.link.shared;
+                let runtime = shared.board.find(&order.uid).map(|(runtime, _)| runtime);
+                shared.execs.begin(self.link.dialer.clone(), runtime, order);
+            }
             Hear::Tickets(tickets) => self.link.shared.desks.admit(tickets),
             Hear::LogCancel(cancel) => {
                 if let Some(reader) = self.requests.remove(&cancel.id) {
@@ -336,14 +316,9 @@ impl Session<'_> {
     }
 
     async fn say_reports(&mut self) -> Result<(), SessionError> {
-        let now = Instant::now();
+        let now = clock::boot();
         for (uid, report, acked) in self.link.shared.board.reports() {
-            let said = self.said.get(uid.as_str());
-            let fresh = said.is_none_or(|(sequence, _)| report.sequence > *sequence);
-            let unanswered = acked < report.sequence
-                && said.is_some_and(|(_, at)| now.duration_since(*at) >= SAY_AGAIN);
-            if fresh || unanswered {
-                self.said.insert(uid.to_string(), (report.sequence, now));
+            if self.journal.is_due(&uid, report.sequence, acked, now) {
                 self.say(Say::Task(report::to_wire(&uid, &report))).await?;
             }
         }
@@ -352,10 +327,10 @@ impl Session<'_> {
 
     async fn say_executors(
         &mut self,
-        executors: &mut watch::Receiver<BTreeSet<TaskUid>>,
+        executors: &mut watch::Receiver<Option<BTreeSet<TaskUid>>>,
     ) -> Result<(), SessionError> {
-        let tasks: Vec<String> =
-            executors.borrow_and_update().iter().map(ToString::to_string).collect();
+        let Some(there) = executors.borrow_and_update().clone() else { return Ok(()) };
+        let tasks: Vec<String> = there.iter().map(ToString::to_string).collect();
         let (door, own) = &mut self.door;
         // Who has no executors needs no door.
         let address = if tasks.is_empty() { None } else { door.address(*own).await };

@@ -1,4 +1,4 @@
-//! Where the robot is. A source is named by a scheme: `static:X,Y[,YAW]`, `file:PATH`, `ros1:TOPIC`.
+//! Where the robot is. A source is named by a scheme: `static:X,Y[,YAW]`, `file:PATH`, `ros1:TOPIC`, `sim:WORLD`.
 //!
 //! A source is a task that puts the newest pose, and whether it counts, into a watch channel at its own pace, and asks nobody. The session tells
 //! the controller what is newest when it has told the last one; nothing queues up. A new scheme is a variant of
@@ -8,6 +8,7 @@ mod file;
 mod fixed;
 mod ros1;
 pub(crate) mod settings;
+mod simulated;
 
 use std::path::PathBuf;
 use std::str::FromStr;
@@ -18,6 +19,7 @@ use tokio::sync::watch;
 use tokio_util::task::AbortOnDropHandle;
 
 use self::settings::PoseSettings;
+use crate::sim::keeper::Simulator;
 
 /// What a source says.
 #[derive(Debug, Clone, PartialEq)]
@@ -84,17 +86,23 @@ pub(crate) enum PositionSource {
     File(PathBuf),
     /// A topic of ROS 1.
     Ros1(String),
+    /// There is no robot: it is simulated in the world of this file.
+    Sim(PathBuf),
 }
 
 /// Why a text names no source.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub(crate) enum PositionSourceError {
-    #[error("{0:?} names no position source; write static:X,Y[,YAW], file:PATH or ros1:TOPIC")]
+    #[error(
+        "{0:?} names no position source; write static:X,Y[,YAW], file:PATH, ros1:TOPIC or sim:WORLD"
+    )]
     Scheme(String),
     #[error("in static:")]
     Static(#[source] FixedPositionError),
     #[error("file:{0} is no absolute path; write file:/run/robot/pose")]
     File(String),
+    #[error("sim: names no world; write sim:world.yaml")]
+    World,
     #[error(transparent)]
     Topic(#[from] muster_ros1::name::NameError),
 }
@@ -114,19 +122,28 @@ impl FromStr for PositionSource {
                 muster_ros1::name::Resolver::new("/", "agent", [])?.resolve(topic)?;
                 Ok(PositionSource::Ros1(topic.to_owned()))
             }
+            Some(("sim", "")) => Err(PositionSourceError::World),
+            Some(("sim", world)) => Ok(PositionSource::Sim(world.into())),
             _ => Err(PositionSourceError::Scheme(text.to_owned())),
         }
     }
 }
 
 impl PositionSource {
-    /// Starts the source of the robot `name`; its poses are in `map`.
-    pub(crate) fn open(&self, map: &str, name: &str, settings: &PoseSettings) -> Position {
-        match self {
+    /// Starts the source of the robot `name`; its poses are in `map`. None: it is a simulator's, and there is none.
+    pub(crate) fn open(
+        &self,
+        map: &str,
+        name: &str,
+        settings: &PoseSettings,
+        simulator: Option<&Simulator>,
+    ) -> Option<Position> {
+        Some(match self {
             PositionSource::Static(place) => fixed::open(*place, map),
             PositionSource::File(path) => file::open(path, map),
             PositionSource::Ros1(topic) => ros1::open(topic, map, name, settings),
-        }
+            PositionSource::Sim(_) => simulated::open(simulator?, map),
+        })
     }
 }
 
@@ -139,8 +156,17 @@ mod tests {
         let file = PositionSource::File("/run/pose".into());
         assert_eq!("file:/run/pose".parse(), Ok(file));
         assert_eq!("ros1:/odom".parse(), Ok(PositionSource::Ros1("/odom".to_owned())));
-        let bad =
-            ["ros1:", "ros1:/a b", "file:pose", "file:", "/run/pose", "ros9:/odom", "static:1"];
+        assert_eq!("sim:w.yaml".parse(), Ok(PositionSource::Sim("w.yaml".into())));
+        let bad = [
+            "sim:",
+            "ros1:",
+            "ros1:/a b",
+            "file:pose",
+            "file:",
+            "/run/pose",
+            "ros9:/odom",
+            "static:1",
+        ];
         for text in bad {
             assert!(text.parse::<PositionSource>().is_err(), "{text}");
         }

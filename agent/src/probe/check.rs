@@ -2,18 +2,23 @@
 
 use std::future::Future;
 use std::net::SocketAddr;
+use std::pin::pin;
+use std::sync::Arc;
 
 use futures::FutureExt;
-use muster_agent_core::probe::{Answer, shorten};
+use muster_agent_core::probe::{Answer, Role, shorten};
 use muster_api::duration::Span;
 use muster_api::kind::task::probe::{HttpCheck, Probe, Scheme, address};
 
-use super::{connect, http, tls};
+use tokio::sync::Mutex;
+
+use super::topic::Topics;
+use super::{connect, http, tls, topic};
 use crate::driver::chain;
 use crate::runtime::{Executed, Launch, Runtime, RuntimeError};
 
 /// What is done.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug)]
 enum What {
     /// A program is run inside the task.
     Exec(Vec<String>),
@@ -21,19 +26,30 @@ enum What {
     Http(SocketAddr, HttpCheck),
     /// A connection is made.
     Tcp(SocketAddr),
+    /// A topic's messages are counted.
+    Topic(Topic),
     /// Admission lets no such probe through; a newer controller may.
     Unknown,
 }
 
+/// A topic, and what is kept between checks of it.
+#[derive(Debug)]
+struct Topic {
+    topics: Arc<Topics>,
+    /// Or why there is none.
+    target: Result<topic::Target, String>,
+    counting: Mutex<Option<topic::Counting>>,
+}
+
 /// A check.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug)]
 pub(super) struct Check {
     what: What,
     timeout: Span,
 }
 
 impl Check {
-    pub(super) fn of(probe: &Probe) -> Check {
+    pub(super) fn of(probe: &Probe, launch: &Launch, topics: &Arc<Topics>) -> Check {
         let at = |host: &Option<String>, port: u16| {
             address(host.as_deref()).map(|ip| SocketAddr::new(ip, port))
         };
@@ -43,7 +59,12 @@ impl Check {
                 at(&http.host, http.port).map(|at| What::Http(at, http.clone()))
             }
             Probe { tcp: Some(tcp), .. } => at(&tcp.host, tcp.port).map(What::Tcp),
-            Probe { exec: None, http: None, tcp: None, .. } => None,
+            Probe { topic: Some(topic), .. } => Some(What::Topic(Topic {
+                topics: Arc::clone(topics),
+                target: topic::Target::of(topic, launch, topics.ros()),
+                counting: Mutex::default(),
+            })),
+            Probe { exec: None, http: None, tcp: None, topic: None, .. } => None,
         };
         Check { what: what.unwrap_or(What::Unknown), timeout: probe.timeout }
     }
@@ -51,10 +72,20 @@ impl Check {
     /// Makes the check. When `over` resolves first, it ends what it began, and its answer means nothing.
     pub(super) async fn answer(
         &self,
+        role: Role,
         runtime: &dyn Runtime,
         launch: &Launch,
         over: impl Future<Output = ()> + Send,
     ) -> Answer {
+        if let What::Topic(Topic { topics, target, counting }) = &self.what {
+            // Nobody is asked who could be late: what came is counted.
+            let mut over = pin!(over);
+            return tokio::select! {
+                biased;
+                answer = topic::answer(topics, target, counting, role) => answer,
+                () = &mut over => Answer::Unknown(String::new()),
+            };
+        }
         let late = tokio::time::sleep(self.timeout.as_duration());
         let until = async {
             tokio::select! {
@@ -79,7 +110,9 @@ impl Check {
                 answer = over_tcp(runtime, launch, *at) => answer,
                 () = until => too_late(),
             },
-            What::Unknown => Answer::Unknown("this agent knows no such check".to_owned()),
+            What::Topic(_) | What::Unknown => {
+                Answer::Unknown("this agent knows no such check".to_owned())
+            }
         }
     }
 }

@@ -1,7 +1,7 @@
 //! Makes the checks of a running attempt, when the core says that one is due.
 //!
 //! ```text
-//! Prober (core: what is due) ──▶ Check ──▶ exec in the task │ http, tcp in its network ──▶ Answer ──▶ Prober ──▶ Verdict
+//! Prober (core: what is due) ──▶ Check ──▶ exec in the task │ http, tcp in its network │ topic ──▶ Answer ──▶ Prober ──▶ Verdict
 //! ```
 //!
 //! | module | holds |
@@ -10,6 +10,7 @@
 //! | [`connect`] | a connection in a task's own network |
 //! | [`http`] | a GET over one |
 //! | [`tls`] | the same, encrypted |
+//! | [`topic`] | ROS topics, counted |
 //!
 //! A [`Probing`] belongs to the driver of its task and to one attempt. Before the driver ends an attempt, or says that it
 //! has ended, it waits for [`Probing::end`]: no check of it is left then.
@@ -18,6 +19,7 @@ mod check;
 mod connect;
 mod http;
 mod tls;
+pub(crate) mod topic;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -34,6 +36,7 @@ use crate::clock;
 use crate::driver::sleep_until;
 use crate::runtime::{Launch, Runtime};
 use check::Check;
+use topic::Topics;
 
 /// The checks of one attempt.
 pub(crate) struct Probing {
@@ -55,7 +58,7 @@ impl Probing {
     pub(crate) fn begin(
         workload: &Workload,
         spec: &TaskSpec,
-        runtime: &Arc<dyn Runtime>,
+        (runtime, topics): (&Arc<dyn Runtime>, &Arc<Topics>),
         launch: impl FnOnce() -> Launch,
     ) -> Option<Probing> {
         let State::Running { started } = workload.state else { return None };
@@ -67,15 +70,17 @@ impl Probing {
         // The date may have been set since: then the delay counts from now at the latest.
         let ran_ms = u64::try_from(now.wall.0 - started.at.0).unwrap_or(0);
         let begun = Boot(now.boot.0.saturating_sub(ran_ms));
+        let launch = launch();
         let check = |(role, probe): (Role, &Option<Probe>)| {
-            Some((role, Arc::new(Check::of(probe.as_ref()?))))
+            Some((role, Arc::new(Check::of(probe.as_ref()?, &launch, topics))))
         };
+        let checks = roles(spec).into_iter().filter_map(check).collect();
         Some(Probing {
             attempt: workload.attempt,
             prober: Prober::new(probes, &workload.verdicts, begun),
-            checks: roles(spec).into_iter().filter_map(check).collect(),
+            checks,
             runtime: Arc::clone(runtime),
-            launch: Arc::new(launch()),
+            launch: Arc::new(launch),
             under_way: JoinSet::new(),
             over: CancellationToken::new(),
             warned: BTreeSet::new(),
@@ -131,7 +136,7 @@ impl Probing {
         let (runtime, launch) = (Arc::clone(&self.runtime), Arc::clone(&self.launch));
         let over = self.over.clone();
         self.under_way.spawn(async move {
-            (role, check.answer(runtime.as_ref(), &launch, over.cancelled()).await)
+            (role, check.answer(role, runtime.as_ref(), &launch, over.cancelled()).await)
         });
     }
 

@@ -13,7 +13,7 @@ use muster_api::id::TaskUid;
 use tokio::sync::Notify;
 
 use super::{
-    AttemptId, Launch, Launched, Limits, LogQuery, Runtime, RuntimeError, RuntimeStatus, Used,
+    AttemptId, Launch, Launched, Limits, LogQuery, Pull, Runtime, RuntimeError, RuntimeStatus, Used,
 };
 
 /// The fake. An answer that was not given never comes.
@@ -21,6 +21,8 @@ use super::{
 pub(crate) struct Fake {
     pub(crate) launches: Mutex<VecDeque<Launched>>,
     pub(crate) finds: Mutex<VecDeque<Observed>>,
+    fetches: Mutex<VecDeque<Result<(), Failure>>>,
+    fetch: Notify,
     exits: Mutex<VecDeque<Exit>>,
     exited: Notify,
     asked: Mutex<Vec<String>>,
@@ -34,6 +36,12 @@ impl Fake {
 
     fn ask(&self, what: &str, id: &AttemptId) {
         self.asked.lock().unwrap().push(format!("{what} {}", id.attempt));
+    }
+
+    /// What came of the fetch that is under way.
+    pub(crate) fn fetched(&self, result: Result<(), Failure>) {
+        self.fetches.lock().unwrap().push_back(result);
+        self.fetch.notify_one();
     }
 
     /// The running attempt ends.
@@ -60,6 +68,20 @@ impl Runtime for Fake {
     fn prepare<'a>(&'a self, launch: &'a Launch) -> BoxFuture<'a, Result<(), Failure>> {
         self.ask("prepare", &launch.id);
         async { Ok(()) }.boxed()
+    }
+
+    fn fetch<'a>(&'a self, image: &'a str, _: Pull) -> BoxFuture<'a, Result<(), Failure>> {
+        self.asked.lock().unwrap().push(format!("fetch {image}"));
+        async {
+            loop {
+                let result = self.fetches.lock().unwrap().pop_front();
+                match result {
+                    Some(result) => return result,
+                    None => self.fetch.notified().await,
+                }
+            }
+        }
+        .boxed()
     }
 
     fn launch<'a>(&'a self, launch: &'a Launch) -> BoxFuture<'a, Launched> {

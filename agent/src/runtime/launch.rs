@@ -64,6 +64,9 @@ pub(crate) struct Work {
     pub(crate) name: String,
     /// Name of the executor's task, in the same namespace.
     pub(crate) executor: String,
+    /// Id of the framework whose work and executor it is; none: declared.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(crate) framework: Option<String>,
     pub(crate) data: serde_json::Map<String, serde_json::Value>,
     pub(crate) lease: Option<Lease>,
 }

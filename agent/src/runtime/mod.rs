@@ -22,13 +22,17 @@ use std::os::fd::OwnedFd;
 
 use bytes::Bytes;
 use futures::future::{BoxFuture, FutureExt};
-use futures::stream::BoxStream;
+use futures::stream::{BoxStream, StreamExt as _};
 use muster_agent_core::desired::StopTimes;
 use muster_agent_core::observed::{Exit, Observed, Started};
 use muster_agent_core::workload::Failure;
 use muster_api::id::TaskUid;
 
-pub(crate) use launch::{AttemptId, Launch, Limits, Used};
+use crate::exec::ends::{Ends, Invocation, Outlet, Ran, Stream};
+pub(crate) use launch::{AttemptId, Launch, Limits, Pull, Used};
+
+/// Why an image is not on the node, one word.
+pub(crate) const IMAGE_PULL_FAILED: &str = "ImagePullFailed";
 
 /// What came of a program that was run beside an attempt.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -95,6 +99,13 @@ pub(crate) struct LogQuery {
     pub(crate) since: Option<jiff::Timestamp>,
 }
 
+impl LogQuery {
+    /// Only what is written after this.
+    pub(crate) fn from_now_on() -> LogQuery {
+        LogQuery { follow: true, tail: Some(0), ..LogQuery::default() }
+    }
+}
+
 /// Starts, watches, ends and removes attempts. Every answer of [`Runtime::wait`] and of
 /// `Ended` means that the kernel shows no process of the attempt any more.
 pub(crate) trait Runtime: Send + Sync + std::fmt::Debug {
@@ -102,6 +113,12 @@ pub(crate) trait Runtime: Send + Sync + std::fmt::Debug {
     fn status(&self) -> RuntimeStatus;
     /// Fetches what the launch needs. May be dropped at any await: what was fetched stays.
     fn prepare<'a>(&'a self, launch: &'a Launch) -> BoxFuture<'a, Result<(), Failure>>;
+    /// Has an image on the node, when this runtime runs images. May be dropped at any await: what was fetched stays.
+    fn fetch<'a>(&'a self, image: &'a str, _: Pull) -> BoxFuture<'a, Result<(), Failure>> {
+        let message = format!("image {image:?}: this runtime runs no images");
+        let reason = IMAGE_PULL_FAILED.to_owned();
+        futures::future::ready(Err(Failure { reason, message, retry: false })).boxed()
+    }
     /// Starts the attempt.
     fn launch<'a>(&'a self, launch: &'a Launch) -> BoxFuture<'a, Launched>;
     /// What became of an attempt of an earlier life of the agent.
@@ -130,6 +147,44 @@ pub(crate) trait Runtime: Send + Sync + std::fmt::Debug {
     ) -> BoxFuture<'a, Result<Executed, RuntimeError>> {
         let error = RuntimeError::new("run a program beside a task", "it has no processes");
         futures::future::ready(Err(error)).boxed()
+    }
+    /// Whether attempts have processes of their own, which programs may be run beside.
+    fn has_processes(&self) -> bool {
+        false
+    }
+    /// Whether a process is one of a running attempt; none: this runtime does not know of the attempt, or not yet.
+    fn has(&self, _: &AttemptId, _: i32) -> Option<bool> {
+        None
+    }
+    /// Runs a program beside a running attempt, as [`Runtime::exec`] does, for a client: with its input and output, or
+    /// with a terminal. It is killed with all of its session when `until` resolves first, or this is dropped.
+    fn interact<'a>(
+        &'a self,
+        _: &'a AttemptId,
+        _: &'a Invocation,
+        _: Ends,
+        _: BoxFuture<'a, ()>,
+    ) -> BoxFuture<'a, Result<Ran, RuntimeError>> {
+        let error = RuntimeError::new("run a program in a task", "it has no processes");
+        futures::future::ready(Err(error)).boxed()
+    }
+    /// Gives a client what a running attempt writes from now on, until it ends.
+    fn attach<'a>(
+        &'a self,
+        id: &'a AttemptId,
+        output: &'a Outlet,
+    ) -> BoxFuture<'a, Result<(), RuntimeError>> {
+        let mut parts = self.logs(id, LogQuery::from_now_on());
+        async move {
+            while let Some(part) = parts.next().await {
+                let part = part.map_err(|error| RuntimeError::new("follow a task", error))?;
+                if output.send(Stream::Stdout, part).await.is_err() {
+                    break;
+                }
+            }
+            Ok(())
+        }
+        .boxed()
     }
     /// The network of a running attempt.
     fn network<'a>(&'a self, _: &'a Launch) -> BoxFuture<'a, Result<Reached, RuntimeError>> {

@@ -79,16 +79,32 @@ pub(super) fn start(
             .map_err(|source| StartError::Step { step: "make its pipes", source: source.into() })
     };
     let ((stdout, child_stdout), (stderr, child_stderr)) = (pipe()?, pipe()?);
-    let child = spawn((order, given), argv, (child_stdout, child_stderr), false)?;
+    let streams = Streams {
+        stdin: Stdio::null(),
+        stdout: child_stdout,
+        stderr: child_stderr,
+        terminal: false,
+    };
+    let child = spawn((order, given), argv, streams, false)?;
     Ok(Started { pid: child.id().cast_signed(), stdout, stderr })
 }
 
-/// Starts `argv` where and as whom the order's own program was started, with these as its output. `given`: variables that
+/// A program's streams.
+#[derive(Debug)]
+pub(crate) struct Streams {
+    pub(crate) stdin: Stdio,
+    pub(crate) stdout: OwnedFd,
+    pub(crate) stderr: OwnedFd,
+    /// They are a terminal, and become that of its session.
+    pub(crate) terminal: bool,
+}
+
+/// Starts `argv` where and as whom the order's own program was started, with these as its streams. `given`: variables that
 /// are not in the order. `tied`: it is killed when the thread that called this ends.
 pub(crate) fn spawn(
     (order, given): (&Order, &BTreeMap<OsString, OsString>),
     argv: &[String],
-    (stdout, stderr): (OwnedFd, OwnedFd),
+    streams: Streams,
     tied: bool,
 ) -> Result<std::process::Child, StartError> {
     let Program::Process { working_dir, user, .. } = &order.launch.program else {
@@ -125,8 +141,9 @@ pub(crate) fn spawn(
     if let Some((name, value)) = mark(&order.launch.id).split_once('=') {
         command.env(name, value);
     }
-    command.stdin(Stdio::null()).stdout(stdout).stderr(stderr);
+    command.stdin(streams.stdin).stdout(streams.stdout).stderr(streams.stderr);
     let child = Child {
+        terminal: streams.terminal,
         entrances: entrances.iter().map(AsRawFd::as_raw_fd).collect(),
         identity,
         dir: CString::new(dir.as_os_str().as_encoded_bytes())
@@ -166,6 +183,8 @@ struct Child {
     identity: Option<Identity>,
     dir: CString,
     step: RawFd,
+    /// Its standard input is a terminal.
+    terminal: bool,
     /// The process whose end is its end.
     tied_to: Option<i32>,
 }
@@ -196,9 +215,16 @@ impl Child {
         self.entrances.iter().all(|fd| unsafe { libc::write(*fd, c"0".as_ptr().cast(), 1) } == 1)
     }
 
+    /// With a terminal of its own, which belongs to whom the program will be.
     fn make_session(&self) -> bool {
-        // SAFETY: no arguments.
-        unsafe { libc::setsid() != -1 }
+        let owner = self.identity.as_ref().map(|identity| identity.uid);
+        // SAFETY: numbers only, and a descriptor that every program has.
+        unsafe {
+            libc::setsid() != -1
+                && (!self.terminal
+                    || libc::ioctl(0, libc::TIOCSCTTY, 0) == 0
+                        && owner.is_none_or(|uid| libc::fchown(0, uid, libc::gid_t::MAX) == 0))
+        }
     }
 
     fn take_groups(&self) -> bool {

@@ -138,6 +138,12 @@ impl Agent {
         pid.trim().parse().unwrap_or(0)
     }
 
+    /// What the agent has read, of files and of sockets. It reads with each heartbeat.
+    pub fn bytes_read(&self) -> u64 {
+        let io = std::fs::read_to_string(format!("/proc/{}/io", self.pid())).unwrap();
+        io.lines().find_map(|line| line.strip_prefix("rchar: ")).unwrap().parse().unwrap()
+    }
+
     /// The directory of an attempt's group for a controller.
     #[track_caller]
     pub fn group(&self, uid: &str, attempt: u32, controller: &str) -> PathBuf {

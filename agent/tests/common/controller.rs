@@ -22,8 +22,8 @@ use rustls::pki_types::pem::PemObject;
 use rustls::pki_types::{CertificateDer, PrivateKeyDer};
 use rustls::server::WebPkiClientVerifier;
 use tokio::net::TcpListener;
-use tokio::sync::mpsc;
-use tokio_stream::wrappers::UnboundedReceiverStream;
+use tokio::sync::{mpsc, watch};
+use tokio_stream::wrappers::{UnboundedReceiverStream, WatchStream};
 use tonic::{Request, Response, Status, Streaming};
 
 use super::until;
@@ -55,18 +55,23 @@ struct Seen {
     logs: BTreeMap<u64, (Vec<u8>, Option<String>)>,
     messages: Vec<proto::Message>,
     executors: Vec<Vec<String>>,
-    /// Where the agent takes messages of frameworks, as it said last.
+    /// Where the agent takes messages of frameworks, as it said when it last had executors.
     door: String,
     /// Certificates are for clients only.
     older: bool,
     session: Option<mpsc::UnboundedSender<Result<proto::ControllerMessage, Status>>>,
+    told: Option<mpsc::UnboundedSender<Result<proto::Message, Status>>>,
     /// What every session begins with.
     assignments: BTreeMap<String, proto::Assignment>,
     /// Heartbeats and reports are not answered.
     mute: bool,
     /// Sessions are refused.
     away: bool,
-    order: Option<proto::NodeOrder>,
+    /// What agents say is not read.
+    stuck: watch::Sender<bool>,
+    /// Of that, messages of executors.
+    stuck_messages: watch::Sender<bool>,
+    order: watch::Sender<proto::NodeOrder>,
     joins: u32,
 }
 
@@ -147,11 +152,21 @@ impl Controller {
     }
 
     /// Ends the session, and refuses others until told otherwise.
+    /// Whether what agents say is left where it is.
+    pub fn set_stuck(&self, stuck: bool) {
+        self.seen(|seen| seen.stuck.send_replace(stuck));
+    }
+
+    pub fn set_stuck_messages(&self, stuck: bool) {
+        self.seen(|seen| seen.stuck_messages.send_replace(stuck));
+    }
+
     pub fn set_away(&self, away: bool) {
         self.seen(|seen| {
             seen.away = away;
             if away {
                 seen.session = None;
+                seen.told = None;
             }
         });
     }
@@ -254,13 +269,20 @@ impl Controller {
     /// Says something to an executor, as its framework would.
     pub fn message(&self, executor: &str, data: Vec<u8>) {
         let executor = executor.to_owned();
-        self.say(Say::Message(proto::Message { executor, data: data.into(), mark: 0 }));
+        self.tell(proto::Message { executor, data: data.into(), mark: 0 });
     }
 
     /// The mark of a line, behind what was said to the executor before.
     pub fn mark(&self, executor: &str, mark: u64) {
         let executor = executor.to_owned();
-        self.say(Say::Message(proto::Message { executor, mark, ..Default::default() }));
+        self.tell(proto::Message { executor, mark, ..Default::default() });
+    }
+
+    /// Waits for the stream of messages that the agent opens when it has executors.
+    #[track_caller]
+    fn tell(&self, message: proto::Message) {
+        let stream = until("a stream of messages", || self.seen(|seen| seen.told.clone()));
+        let _ = stream.send(Ok(message));
     }
 
     /// Says who may come to an executor directly; none: nobody.
@@ -313,8 +335,7 @@ impl Controller {
     /// What a person decides about the node.
     pub fn order_estop(&self, estop_tier: u32, estop_release: u64) {
         let order = proto::NodeOrder { estop_tier, estop_release };
-        self.seen(|seen| seen.order = Some(order));
-        self.say(Say::Order(order));
+        self.seen(|seen| seen.order.send_replace(order));
     }
 
     pub fn cancel_logs(&self, id: u64) {
@@ -461,6 +482,44 @@ struct Service(Arc<Mutex<Seen>>);
 impl AgentService for Service {
     type SessionStream =
         Pin<Box<dyn Stream<Item = Result<proto::ControllerMessage, Status>> + Send>>;
+    type MessagesStream = Pin<Box<dyn Stream<Item = Result<proto::Message, Status>> + Send>>;
+    type OrdersStream = Pin<Box<dyn Stream<Item = Result<proto::NodeOrder, Status>> + Send>>;
+
+    async fn orders(
+        &self,
+        _: Request<proto::OrdersRequest>,
+    ) -> Result<Response<Self::OrdersStream>, Status> {
+        let seen = self.0.lock().unwrap();
+        if seen.away {
+            return Err(Status::unavailable("away"));
+        }
+        let orders = WatchStream::new(seen.order.subscribe());
+        Ok(Response::new(Box::pin(orders.map(Ok))))
+    }
+
+    async fn messages(
+        &self,
+        request: Request<Streaming<proto::Message>>,
+    ) -> Result<Response<Self::MessagesStream>, Status> {
+        let (told, messages) = mpsc::unbounded_channel();
+        let (mut heard, seen) = (request.into_inner(), Arc::clone(&self.0));
+        let mut stuck = {
+            let mut seen = seen.lock().unwrap();
+            if seen.away {
+                return Err(Status::unavailable("away"));
+            }
+            seen.told = Some(told);
+            seen.stuck_messages.subscribe()
+        };
+        tokio::spawn(async move {
+            while stuck.wait_for(|stuck| !stuck).await.is_ok()
+                && let Some(Ok(message)) = heard.next().await
+            {
+                seen.lock().unwrap().messages.push(message);
+            }
+        });
+        Ok(Response::new(Box::pin(UnboundedReceiverStream::new(messages))))
+    }
 
     async fn session(
         &self,
@@ -488,11 +547,13 @@ impl AgentService for Service {
                 released: vec![],
                 kept: Vec::new(),
             }));
-            say(Say::Order(seen.order.unwrap_or_default()));
             seen.session = Some(out);
         }
+        let mut stuck = seen.lock().unwrap().stuck.subscribe();
         tokio::spawn(async move {
-            while let Some(Ok(message)) = heard.next().await {
+            while stuck.wait_for(|stuck| !stuck).await.is_ok()
+                && let Some(Ok(message)) = heard.next().await
+            {
                 take(&mut seen.lock().unwrap(), message.body.unwrap());
             }
         });
@@ -532,11 +593,10 @@ fn take(seen: &mut Seen, heard: Heard) {
         }
         Heard::Executors(executors) => {
             seen.executors.push(executors.tasks);
-            seen.door = executors.address;
-            None
-        }
-        Heard::Message(message) => {
-            seen.messages.push(message);
+            // Also when the last executor has gone: who knows the place may still come there.
+            if !executors.address.is_empty() {
+                seen.door = executors.address;
+            }
             None
         }
         Heard::Log(chunk) => {

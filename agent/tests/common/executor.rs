@@ -5,6 +5,7 @@ use std::os::unix::net::UnixStream;
 
 use muster_api::wire::executor::v1 as proto;
 use prost::Message;
+use proto::TaskState;
 use proto::call::Call as Say;
 use proto::event::Event as Heard;
 
@@ -77,6 +78,28 @@ impl Executor {
             Heard::Launch(launch) => launch,
             other => panic!("no launch: {other:?}"),
         }
+    }
+
+    /// Says so many updates without reading an answer; how many were taken before nobody read them any more.
+    pub fn flood(&mut self, work: &str, most: u64) -> u64 {
+        self.stream.set_write_timeout(Some(std::time::Duration::from_secs(2))).unwrap();
+        for said in 0..most {
+            let update = proto::StatusUpdate {
+                task: work.to_owned(),
+                sequence: self.sequence + said + 1,
+                state: TaskState::Running.into(),
+                ..proto::StatusUpdate::default()
+            };
+            let call = proto::Call { call: Some(Say::StatusUpdate(update)) };
+            let mut bytes = Vec::new();
+            let length = u32::try_from(call.encoded_len()).unwrap();
+            bytes.extend_from_slice(&length.to_be_bytes());
+            call.encode(&mut bytes).unwrap();
+            if self.stream.write_all(&bytes).is_err() {
+                return said;
+            }
+        }
+        most
     }
 
     /// Says it, and waits until the agent has it on its disk.

@@ -271,6 +271,39 @@ def test_a_broken_session_is_resumed_with_the_id(controller, start):
     scheduler.heard.expect("status_update")
 
 
+def test_suppressed_offers_stay_so_in_the_next_session(controller, start):
+    driver, scheduler, session = registered(controller, start)
+    suppressed = driver.suppress_offers()
+    session.expect("suppress")
+    session.answer()
+    suppressed.result(PATIENCE)
+    session.end()
+    scheduler.heard.expect("disconnected")
+    again = controller.accept()
+    again.subscribed(reregistered=True)
+    again.expect("suppress")
+    revived = driver.revive_offers()
+    again.expect("revive")
+    again.answer()
+    revived.result(PATIENCE)
+    again.end()
+    scheduler.heard.expect("reregistered")
+    third = controller.accept()
+    third.subscribed(reregistered=True)
+    driver.kill_task("t-1")
+    third.expect("kill")  # And nothing before it.
+
+
+def test_a_run_is_known_by_its_nonce_until_it_has_an_id(controller, start):
+    start()
+    first = controller.accept()
+    lost = first.expect("subscribe")
+    first.end()  # Its Subscribed does not arrive.
+    again = controller.accept().subscribed()
+    assert lost.nonce and again.nonce == lost.nonce
+    assert (lost.framework_id, again.framework_id) == ("", "")
+
+
 def test_wishes_said_while_away_are_said_after_and_only_the_last_of_each(controller, start):
     driver, scheduler, session = registered(controller, start)
     session.end()

@@ -51,11 +51,13 @@ pub enum Event {
 /// Messages of executors that come when so many events wait already are dropped: they come at most once anyway, and
 /// may be large. All else waits, however long: it is little, and an answer may be behind it.
 const MOST_WAITING: usize = 1024;
+/// And those that come when messages of so many bytes wait.
+const MOST_BYTES: usize = 64 << 20;
 
 /// Begins a stream.
 pub(crate) fn channel() -> (Outlet, Inlet) {
     let (sender, events) = mpsc::unbounded_channel();
-    let waiting = Arc::new(AtomicUsize::new(0));
+    let waiting = Arc::<Waiting>::default();
     let inlet = Inlet { events, waiting: Arc::clone(&waiting), heard: VecDeque::new() };
     (Outlet { sender, waiting }, inlet)
 }
@@ -65,20 +67,40 @@ pub(crate) fn channel() -> (Outlet, Inlet) {
 #[derive(Debug, Clone)]
 pub(crate) struct Outlet {
     sender: mpsc::UnboundedSender<Event>,
-    waiting: Arc<AtomicUsize>,
+    waiting: Arc<Waiting>,
+}
+
+/// What the framework's code has not taken yet.
+#[derive(Debug, Default)]
+struct Waiting {
+    events: AtomicUsize,
+    /// Of messages.
+    bytes: AtomicUsize,
+}
+
+impl Waiting {
+    fn gone(&self, events: usize) {
+        self.events.fetch_sub(events, Ordering::Relaxed);
+    }
 }
 
 impl Outlet {
     pub(crate) fn send(&self, event: Event) {
-        let waiting = self.waiting.load(Ordering::Relaxed);
-        if matches!(event, Event::Message(_)) && waiting >= MOST_WAITING {
-            tracing::warn!(
-                waiting,
-                "a message of an executor is dropped: the framework does not keep up"
-            );
-            return;
+        let Waiting { events, bytes } = &*self.waiting;
+        if let Event::Message(message) = &event {
+            let (size, events) = (message.data.len(), events.load(Ordering::Relaxed));
+            let waiting = bytes.load(Ordering::Relaxed);
+            if events >= MOST_WAITING || waiting + size > MOST_BYTES {
+                tracing::warn!(
+                    events,
+                    bytes = waiting,
+                    "a message of an executor is dropped: the framework does not keep up"
+                );
+                return;
+            }
+            bytes.fetch_add(size, Ordering::Relaxed);
         }
-        self.waiting.fetch_add(1, Ordering::Relaxed);
+        events.fetch_add(1, Ordering::Relaxed);
         // A stream that was dropped ends the session; see closed().
         drop(self.sender.send(event));
     }
@@ -93,7 +115,7 @@ impl Outlet {
 #[derive(Debug)]
 pub(crate) struct Inlet {
     events: mpsc::UnboundedReceiver<Event>,
-    waiting: Arc<AtomicUsize>,
+    waiting: Arc<Waiting>,
     /// What has come and is not given yet.
     heard: VecDeque<Event>,
 }
@@ -111,7 +133,10 @@ impl Inlet {
         };
         match self.heard.pop_front() {
             Some(event) => {
-                self.waiting.fetch_sub(1, Ordering::Relaxed);
+                self.waiting.gone(1);
+                if let Event::Message(message) = &event {
+                    self.waiting.bytes.fetch_sub(message.data.len(), Ordering::Relaxed);
+                }
                 Poll::Ready(Some(event))
             }
             None if closed => Poll::Ready(None),
@@ -127,7 +152,7 @@ impl Inlet {
                     index.map(|index| over.swap_remove(index)).is_some()
                 });
                 if over.is_empty() {
-                    self.waiting.fetch_sub(1, Ordering::Relaxed);
+                    self.waiting.gone(1);
                     return;
                 }
             }
@@ -147,7 +172,7 @@ impl Inlet {
             }
             _ => true,
         });
-        self.waiting.fetch_sub(before - self.heard.len(), Ordering::Relaxed);
+        self.waiting.gone(before - self.heard.len());
     }
 }
 
@@ -225,6 +250,18 @@ mod tests {
         }
         assert_eq!(stream.next().await, Some(Event::Disconnected));
         outlet.send(Event::Message(proto::Message::default()));
+        assert!(matches!(stream.next().await, Some(Event::Message(_))));
+
+        let largest = proto::Message { data: vec![0; 4 << 20].into(), ..Default::default() };
+        for _ in 0..20 {
+            outlet.send(Event::Message(largest.clone()));
+        }
+        outlet.send(Event::Disconnected);
+        for _ in 0..MOST_BYTES / largest.data.len() {
+            assert!(matches!(stream.next().await, Some(Event::Message(_))));
+        }
+        assert_eq!(stream.next().await, Some(Event::Disconnected), "the rest was dropped");
+        outlet.send(Event::Message(largest));
         assert!(matches!(stream.next().await, Some(Event::Message(_))));
     }
 }

@@ -135,6 +135,7 @@ impl Builder {
             filter: self.filter.map(|filter| filter.0),
             failover_timeout_seconds: self.failover.map(|timeout| timeout.as_secs_f64()),
             direct: true,
+            nonce: uuid::Uuid::new_v4().to_string(),
         };
         let (to_session, commands) = mpsc::channel(CALLS);
         let (to_stream, inlet) = event::channel();

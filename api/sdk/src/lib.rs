@@ -19,6 +19,7 @@
 //! | [`filter`] | what a node must have to be offered |
 //! | [`poses`] | for a building's localisation: a stream of robots' poses |
 //! | [`gate`] | for tasks: commands for a robot's actuators |
+//! | [`sensor`] | for tasks: frames of a robot's sensors |
 //! | [`executor`] | the other side: a program that runs a framework's tasks |
 //! | `link` | the session: kubeconfig, TLS, reconnecting, duplicates |
 //!
@@ -39,6 +40,7 @@ mod link;
 pub mod poses;
 pub mod position;
 pub mod scheduler;
+pub mod sensor;
 
 pub use error::{CallRefused, Cause, ConnectError, FrameworkError, KubeconfigError, Reason};
 pub use event::{Event, EventStream};

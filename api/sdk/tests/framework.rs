@@ -159,6 +159,20 @@ async fn an_update_is_called_back_once_and_acknowledged_whenever_it_is_repeated(
 }
 
 #[tokio::test]
+async fn a_run_that_has_not_heard_its_id_is_known_by_its_nonce() {
+    let mut controller = Controller::start().await;
+    let framework = Framework::builder("deliver").connect(Some(&controller.kubeconfig())).await;
+    let (_handle, mut events) = framework.expect("configured");
+    let mut lost = controller.session().await;
+    let (_, Say::Subscribe(first)) = lost.call().await else { panic!("no Subscribe") };
+    drop(lost);
+    let again = controller.session().await.subscribe("f1", SELDOM_MS).await;
+    assert!(!first.nonce.is_empty());
+    assert_eq!((again.framework_id.as_str(), again.nonce), ("", first.nonce));
+    assert_eq!(next(&mut events).await, Event::Registered { framework_id: "f1".to_owned() });
+}
+
+#[tokio::test]
 async fn messages_of_four_mebibytes_pass_both_ways() {
     let mut controller = Controller::start().await;
     let (mut session, mut notes, _driver) = driven(&mut controller).await;
@@ -289,6 +303,25 @@ async fn an_id_of_an_earlier_run_that_is_not_known_any_more_is_given_up() {
     assert_eq!(session.subscribe("new", SELDOM_MS).await.framework_id, "");
     assert_eq!(next(&mut events).await, Event::Registered { framework_id: "new".to_owned() });
     assert_eq!(std::fs::read_to_string(controller.path("state")).expect("kept"), "new\n");
+}
+
+#[tokio::test]
+async fn who_was_away_for_too_long_begins_anew_and_who_is_ended_does_not() {
+    let mut controller = Controller::start().await;
+    let (_handle, mut events, session) = registered(&mut controller).await;
+    drop(session);
+    assert_eq!(next(&mut events).await, Event::Disconnected);
+    let unknown = || proto::Error { reason: "UnknownFramework".to_owned(), message: String::new() };
+    let mut session = controller.session().await;
+    let (_, Say::Subscribe(_)) = session.call().await else { panic!("no Subscribe") };
+    session.say(Tell::Error(unknown())).await;
+    let mut session = controller.session().await;
+    assert_eq!(session.subscribe("f2", SELDOM_MS).await.framework_id, "");
+    assert_eq!(next(&mut events).await, Event::Registered { framework_id: "f2".to_owned() });
+    session.say(Tell::Error(unknown())).await;
+    assert!(
+        matches!(next(&mut events).await, Event::Error(error) if error.reason == "UnknownFramework")
+    );
 }
 
 #[tokio::test]

@@ -2,6 +2,8 @@
 
 use std::fmt;
 
+use crate::secret::same;
+
 /// Bytes of a secret.
 pub const SECRET_BYTES: usize = 32;
 
@@ -29,11 +31,9 @@ impl Secret {
     }
 }
 
-/// In a time that does not tell how much of it was right.
 impl PartialEq for Secret {
     fn eq(&self, other: &Secret) -> bool {
-        let differences = self.0.iter().zip(other.0).fold(0, |all, (a, b)| all | (a ^ b));
-        std::hint::black_box(differences) == 0
+        same(&self.0, &other.0)
     }
 }
 

@@ -15,11 +15,13 @@ pub(super) const INFO: KindInfo = KindInfo {
     has_status: false,
     schema: |g| g.subschema_for::<Event>(),
     selectable: &[
+        "involvedObject.apiVersion",
         "involvedObject.kind",
         "involvedObject.name",
         "involvedObject.namespace",
         "involvedObject.uid",
         "reason",
+        "reportingComponent",
         "type",
     ],
     admit_body: admit_core::<Event>,

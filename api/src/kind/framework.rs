@@ -22,11 +22,17 @@ use crate::validate::Violations;
 pub const FRAMEWORK_LABEL: &str = "muster.dev/framework";
 /// Finalizer of such a task until the framework has acknowledged its end.
 pub const ACKNOWLEDGE_FINALIZER: &str = "muster.dev/framework-acknowledges";
+/// Annotation of a Framework: the nonce of the Subscribe that registered it.
+pub const NONCE_ANNOTATION: &str = "muster.dev/subscribe-nonce";
 /// How long a framework may be away when it says nothing itself. Mesos' default of 0 kills a fleet's work with every
 /// restart of its scheduler.
 pub const DEFAULT_FAILOVER_TIMEOUT: Span = Span::from_secs(60);
 /// Offers that a framework has at once when it names no number ("several closest robots", Avalon, III-C).
 pub const DEFAULT_MOST_OFFERS: u32 = 16;
+
+/// Most offers that a framework may have at once: each is kept, said again with every change of its node, and compared with
+/// what there is.
+pub const MAX_OFFERS: u32 = 1_000;
 
 /// Where the framework works and what it wants to be offered, as it last said.
 #[derive(CustomResource, Debug, Clone, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -87,7 +93,7 @@ pub struct OfferFilter {
     /// Some AR that nobody holds.
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub any_actuator: bool,
-    /// At most so many offers at once, the closest first; 0: [`DEFAULT_MOST_OFFERS`].
+    /// At most so many offers at once, the closest first; 0: [`DEFAULT_MOST_OFFERS`]. No more than [`MAX_OFFERS`].
     pub most: u32,
 }
 
@@ -145,6 +151,13 @@ fn rules(spec: &FrameworkSpec, violations: &mut Violations) {
             .required("spec.position")
             .suggest("the cost TravelTime needs the position to travel to");
     }
+    if spec.filter.most > MAX_OFFERS {
+        let reason =
+            format!("{} offers at once are more than the {MAX_OFFERS} allowed", spec.filter.most);
+        violations
+            .invalid("spec.filter.most", reason)
+            .suggest("name a smaller number; the closest come first, and others take the places of those declined");
+    }
     spec.filter.selector.validate("spec.filter.selector", violations);
 }
 
@@ -189,5 +202,17 @@ mod tests {
             .map(|v| v.path.clone())
             .collect();
         assert_eq!(problems, ["spec.position", "spec.position"]);
+    }
+
+    #[test]
+    fn offers_at_once_are_bounded() {
+        let spec = |most| {
+            let filter = super::OfferFilter { most, ..super::OfferFilter::default() };
+            super::FrameworkSpec { filter, ..super::FrameworkSpec::default() }
+        };
+        assert!(spec(super::MAX_OFFERS).violations().is_empty());
+        let violations = spec(10_000).violations();
+        let paths: Vec<&str> = violations.iter().map(|v| &*v.path).collect();
+        assert_eq!(paths, ["spec.filter.most"]);
     }
 }

@@ -12,6 +12,7 @@ pub mod node;
 pub mod projected;
 pub mod quota;
 pub mod secret;
+pub mod site;
 pub mod task;
 pub mod taskset;
 pub mod taskset_revision;
@@ -110,6 +111,7 @@ pub static ALL: &[KindInfo] = &[
     lease::INFO,
     framework::INFO,
     quota::INFO,
+    site::INFO,
     config_map::INFO,
     secret::INFO,
     namespace::INFO,
@@ -209,6 +211,9 @@ fn check_metadata(info: &KindInfo, object: &Value, violations: &mut Violations) 
     let before = violations.iter().count();
     crate::validate::walk_schema(&known, metadata, "metadata", violations);
     for key in metadata.as_object().into_iter().flat_map(|m| m.keys()) {
+        if violations.is_full() {
+            return;
+        }
         let properties = known.get("properties").and_then(Value::as_object);
         if let Some(properties) = properties.filter(|p| !p.contains_key(key)) {
             let near = did_you_mean(key, properties.keys().map(String::as_str));
@@ -261,6 +266,9 @@ fn check_top_level(info: &KindInfo, object: &Value, violations: &mut Violations)
         .flat_map(|o| o.keys())
         .filter(|k| !KNOWN.contains(&k.as_str()))
     {
+        if violations.is_full() {
+            return;
+        }
         violations.not_supported(member_path("", key), "is not a field").suggestion =
             did_you_mean(key, KNOWN);
     }
@@ -293,9 +301,9 @@ fn admit_spec<S: JsonSchema + Serialize + DeserializeOwned + 'static>(
             }
         }
     } else {
-        found.extend(rules_on_the_rest(spec, &found, rules));
+        found.append(rules_on_the_rest(spec, &found, rules));
     }
-    violations.extend(found);
+    violations.append(found);
 }
 
 /// What a kind's own rules find in a spec whose schema violations are cut out of it, so that one
@@ -337,8 +345,28 @@ fn remove_nulls(value: &mut Value) {
     }
 }
 
-/// Admission of a core kind that k8s-openapi describes: its types must read it.
-fn admit_core<T: DeserializeOwned>(object: &mut Value, violations: &mut Violations) {
+/// Admission of a core kind that k8s-openapi describes: its types must read it, and have every field of it.
+fn admit_core<T: JsonSchema + DeserializeOwned + 'static>(
+    object: &mut Value,
+    violations: &mut Violations,
+) {
+    let schema = schema_of::<T>();
+    let known = schema["properties"].as_object();
+    for (key, member) in object.as_object().into_iter().flatten() {
+        // Metadata is looked at for every kind.
+        match known.and_then(|known| known.get(key)) {
+            _ if key == "metadata" || member.is_null() => {}
+            Some(schema) => crate::validate::walk_fields(schema, member, key, violations),
+            None => {
+                let known = known.into_iter().flat_map(|known| known.keys());
+                violations.not_supported(member_path("", key), "is not a field").suggestion =
+                    did_you_mean(key, known.map(String::as_str));
+            }
+        }
+        if violations.is_full() {
+            return;
+        }
+    }
     if let Err(error) = serde_path_to_error::deserialize::<_, T>(&*object) {
         violations.invalid(error.path().to_string(), error.inner().to_string());
     }
@@ -399,5 +427,33 @@ mod tests {
         );
         assert_eq!(problems(&namespace(json!({})))[0], "metadata.name: is required");
         admit(&namespace(json!({"name": "lab", "labels": {"a.b/c": "d"}}))).expect("good");
+    }
+
+    #[test]
+    fn core_kinds_have_no_other_fields_than_kubernetes_says() {
+        let event = |fields: Value| {
+            let mut event = json!({"apiVersion": "v1", "kind": "Event", "metadata": {"name": "e"},
+                "involvedObject": {"kind": "Task", "name": "t"}, "reason": "Started", "count": 1,
+                "source": {"component": "x"}, "eventTime": null});
+            event
+                .as_object_mut()
+                .expect("fields")
+                .extend(fields.as_object().expect("fields").clone());
+            event
+        };
+        admit(&event(json!({"series": {"count": 2}}))).expect("good");
+        let wrong =
+            event(json!({"foo": {"a": 1}, "series": {"cuont": 2}, "involvedObject": {"nam": "t"}}));
+        assert_eq!(
+            problems(&wrong),
+            [
+                "foo: is not a field",
+                "involvedObject.nam: is not a field; did you mean \"name\"?",
+                "series.cuont: is not a field; did you mean \"count\"?",
+            ]
+        );
+        let namespace = json!({"apiVersion": "v1", "kind": "Namespace", "metadata": {"name": "lab"},
+            "spec": {"finalizers": ["kubernetes"]}, "status": {"phase": "Active", "more": {}}});
+        assert_eq!(problems(&namespace), ["status.more: is not a field"]);
     }
 }

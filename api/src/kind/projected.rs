@@ -1,7 +1,7 @@
 //! Tasks and nodes as core kinds: what tools show that know only Pods and Nodes. They are made when somebody reads them;
-//! nothing is stored under these kinds, and nothing is admitted.
+//! nothing is stored under these kinds, and nothing new is admitted.
 
-pub use k8s_openapi::api::core::v1::{Node, Pod};
+pub use k8s_openapi::api::core::v1::{Node, Pod, Service};
 use serde_json::Value;
 
 use super::{KindInfo, any_change};
@@ -23,7 +23,16 @@ pub static POD: KindInfo = KindInfo {
     short_names: &["po"],
     namespaced: true,
     has_status: true,
-    selectable: &["spec.nodeName", "spec.restartPolicy", "status.phase", "status.podIP"],
+    selectable: &[
+        "spec.hostNetwork",
+        "spec.nodeName",
+        "spec.restartPolicy",
+        "spec.schedulerName",
+        "spec.serviceAccountName",
+        "status.nominatedNodeName",
+        "status.phase",
+        "status.podIP",
+    ],
     schema: |g| g.subschema_for::<Pod>(),
     admit_body: refuse,
     admit_change: any_change,
@@ -41,6 +50,23 @@ pub static NODE: KindInfo = KindInfo {
     has_status: true,
     selectable: &["spec.unschedulable"],
     schema: |g| g.subschema_for::<Node>(),
+    admit_body: refuse,
+    admit_change: any_change,
+};
+
+/// Services, of which there are none here: tasks find each other by ROS or by address. Clients ask for them as a matter of
+/// course (`kubectl cluster-info` before it says where the cluster is), and an empty list is the true answer.
+pub static SERVICE: KindInfo = KindInfo {
+    group: "",
+    version: "v1",
+    kind: "Service",
+    plural: "services",
+    singular: "service",
+    short_names: &["svc"],
+    namespaced: true,
+    has_status: false,
+    selectable: &["spec.clusterIP", "spec.type"],
+    schema: |g| g.subschema_for::<Service>(),
     admit_body: refuse,
     admit_change: any_change,
 };

@@ -11,6 +11,7 @@ mod namespace;
 mod node;
 mod projected;
 mod quota;
+mod site;
 pub mod task;
 pub mod taskset;
 mod taskset_revision;
@@ -142,6 +143,7 @@ pub fn columns(info: &KindInfo) -> &'static dyn Columns {
         (_, "Lease") => &Of(lease::COLUMNS),
         (_, "Framework") => &Of(framework::COLUMNS),
         (_, "Quota") => &Of(quota::COLUMNS),
+        (_, "Site") => &Of(site::COLUMNS),
         (_, "ConfigMap") => &Of(keyed::CONFIG_MAP),
         (_, "Secret") => &Of(keyed::SECRET),
         (_, "Namespace") => &Of(namespace::COLUMNS),

@@ -9,6 +9,7 @@ use super::WireError;
 use super::agent::v1 as proto;
 use crate::condition::{Condition, ConditionStatus};
 use crate::kind::node::estop::{EStopDemand, EStopStatus, EStopTier};
+use crate::kind::node::image::ImageStatus;
 use crate::kind::node::upkeep::Battery;
 use crate::kind::node::{MissionLock, NodeKind, NodeSpec, RuntimeStatus};
 use crate::kind::task::depend::DependencyCondition;
@@ -228,6 +229,8 @@ pub struct NodeReport {
     pub mission_locks: Vec<MissionLock>,
     /// What stops the robot; none: nothing stands before its drivers.
     pub estop: Option<EStopStatus>,
+    /// Images that it was asked to have.
+    pub images: Vec<ImageStatus>,
 }
 
 impl TryFrom<&proto::NodeState> for NodeReport {
@@ -267,6 +270,7 @@ impl TryFrom<&proto::NodeState> for NodeReport {
                 })
                 .collect(),
             estop: state.estop.as_ref().map(EStopStatus::from),
+            images: state.images.iter().map(ImageStatus::try_from).collect::<Result<_, _>>()?,
         })
     }
 }
@@ -346,6 +350,7 @@ impl From<&NodeReport> for proto::NodeState {
                 })
                 .collect(),
             estop: report.estop.as_ref().map(proto::EStop::from),
+            images: report.images.iter().map(proto::ImageState::from).collect(),
         }
     }
 }
@@ -395,6 +400,8 @@ impl From<&proto::Usage> for TaskUsage {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::kind::node::image::{ImagePhase, ImageWish};
+    use crate::kind::task::PullPolicy;
 
     fn report() -> NodeReport {
         NodeReport {
@@ -432,6 +439,17 @@ mod tests {
                     tier: EStopTier::Cut,
                 }],
             }),
+            images: vec![ImageStatus {
+                wish: ImageWish {
+                    image: "lab/detector:2".to_owned(),
+                    pull_policy: PullPolicy::Always,
+                    since: MicroTime(Timestamp::from_second(7).expect("in range")),
+                },
+                phase: ImagePhase::BackOff,
+                reason: "ImagePullFailed".to_owned(),
+                message: "no such image".to_owned(),
+                failures: 2,
+            }],
         }
     }
 

@@ -4,6 +4,7 @@
 pub mod agent_session;
 mod error;
 pub mod framework_session;
+pub mod image;
 pub mod pose_stream;
 mod rope;
 mod secret;
@@ -78,6 +79,21 @@ pub mod gate {
     )]
     pub mod v1 {
         include!(concat!(env!("OUT_DIR"), "/muster.gate.v1.rs"));
+    }
+}
+
+/// Package `muster.sensor`.
+pub mod sensor {
+    /// Messages between an agent and the tasks that read its sensors.
+    #[expect(missing_docs, reason = "generated; the .proto files hold the documentation")]
+    #[allow(
+        clippy::all,
+        clippy::allow_attributes,
+        clippy::allow_attributes_without_reason,
+        reason = "generated"
+    )]
+    pub mod v1 {
+        include!(concat!(env!("OUT_DIR"), "/muster.sensor.v1.rs"));
     }
 }
 

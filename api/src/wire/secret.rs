@@ -6,6 +6,7 @@ use std::fmt;
 use super::agent::v1::{File, Ticket, Variable};
 use super::framework::v1::Direct;
 use super::gate::v1::{Register, Seat};
+use super::sensor::v1::Open;
 
 impl fmt::Debug for Variable {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -34,6 +35,16 @@ impl fmt::Debug for Register {
 impl fmt::Debug for Seat {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.debug_struct("Seat").field("task", &self.task).finish_non_exhaustive()
+    }
+}
+
+impl fmt::Debug for Open {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Open")
+            .field("version", &self.version)
+            .field("queue", &self.queue)
+            .field("inline", &self.inline)
+            .finish_non_exhaustive()
     }
 }
 
@@ -69,7 +80,9 @@ mod tests {
         let register = Register { token: "hunter2".to_owned() };
         let ticket = Ticket { executor: "e-1".to_owned(), secret: b"hunter2".to_vec() };
         let direct = Direct { ticket: b"hunter2".as_slice().into(), ..Direct::default() };
-        let shown = format!("{variable:?} {file:?} {ticket:?} {direct:?} {seat:?} {register:?}");
+        let open = Open { token: "hunter2".to_owned(), ..Open::default() };
+        let shown =
+            format!("{variable:?} {file:?} {ticket:?} {direct:?} {seat:?} {register:?} {open:?}");
         assert!(shown.contains("TOKEN") && shown.contains("key"), "{shown}");
         assert!(!shown.contains("hunter2") && !shown.contains("104, 117"), "{shown}");
     }

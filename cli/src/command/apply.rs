@@ -3,7 +3,8 @@
 //! 1. read and check every document ([`crate::manifests`]): nothing is sent when one is wrong;
 //! 2. look at what is stored and work out the change of each;
 //! 3. let the controller check every change without storing it (only it knows what may not change);
-//! 4. store them: namespaces, nodes, then the rest, more important tasks first.
+//! 4. store them: namespaces, nodes, then the rest, more important tasks first; with `--check-index` all in one commit
+//!    ([`super::transaction`]).
 
 use std::cmp::Reverse;
 use std::collections::BTreeSet;
@@ -15,7 +16,7 @@ use muster_api::duration::Span;
 use serde::Deserialize;
 use serde_json::{Map, Value, json};
 
-use super::{FirstError, Outcome, plan, settle};
+use super::{FirstError, Outcome, plan, settle, transaction};
 use crate::args::span;
 use crate::client::{Client, Mode, group_path};
 use crate::error::CliError;
@@ -37,7 +38,7 @@ pub(crate) struct Args {
     /// Let the controller check everything, and store nothing
     #[arg(long)]
     dry_run: bool,
-    /// Refuse when this is no longer what `muster plan` said under this index; looked at just before anything is stored
+    /// Store everything in one commit, and only while it is still what `muster plan` said under this index
     #[arg(long, value_name = "INDEX")]
     check_index: Option<String>,
     /// Wait until every task runs, has ended, or says why it waits
@@ -59,6 +60,8 @@ pub(super) enum Action {
     Patch {
         patch: Value,
         fields: Vec<FieldChange>,
+        /// Of the object that was looked at.
+        revision: String,
     },
     /// It says this already.
     Nothing(Value),
@@ -73,16 +76,24 @@ pub(super) struct Step {
 pub(crate) async fn run(args: Args, session: &mut Session) -> Outcome {
     let manifests = manifests::load(&args.filename, &session.namespace, session.namespace_given)?;
     let client = &session.client;
-    let steps = look_at_all(client, manifests).await?;
+    let mut steps = look_at_all(client, manifests).await?;
     // One object is checked and stored by one request anyway.
     if args.dry_run || steps.len() > 1 || args.check_index.is_some() {
         rehearse(client, &steps).await?;
     }
-    if let Some(index) = &args.check_index {
-        plan::check(session, &steps, index).await?;
-    }
     let mode = if args.dry_run { Mode::DryRun } else { Mode::Store };
-    let (applied, failed) = store(session, steps, mode, args.output).await?;
+    steps.sort_by_key(rank);
+    let (applied, failed) = match &args.check_index {
+        Some(index) if mode == Mode::Store => {
+            let done = transaction::apply(session, steps, index).await?;
+            (tell(session, done, args.output)?, crate::exit::OK)
+        }
+        Some(index) => {
+            plan::check(session, &steps, index).await?;
+            store(session, steps, mode, args.output).await?
+        }
+        None => store(session, steps, mode, args.output).await?,
+    };
     if failed != crate::exit::OK || !args.wait {
         return Ok(failed);
     }
@@ -149,7 +160,8 @@ fn decide(manifest: &Manifest, current: Option<Value>) -> Action {
             if secret {
                 fields.iter_mut().filter(|f| f.path.starts_with("data")).for_each(hide_change);
             }
-            Action::Patch { fields, patch }
+            let revision = current.pointer("/metadata/resourceVersion").and_then(Value::as_str);
+            Action::Patch { fields, patch, revision: revision.unwrap_or_default().to_owned() }
         }
     }
 }
@@ -175,7 +187,7 @@ fn annotate(object: &mut Value, annotation: Value) {
     annotations[LAST_APPLIED] = annotation;
 }
 
-async fn perform(client: &Client, step: &Step, mode: Mode) -> Result<Value, CliError> {
+pub(super) async fn perform(client: &Client, step: &Step, mode: Mode) -> Result<Value, CliError> {
     let Manifest { info, namespace, name, .. } = &step.manifest;
     let namespace = namespace.as_deref();
     let done = match &step.action {
@@ -285,7 +297,7 @@ async fn together(client: &Client, steps: &[Step]) -> Result<(), CliError> {
 fn rank(step: &Step) -> (u8, Reverse<i64>) {
     let first = match step.manifest.info.kind {
         "Namespace" => 0,
-        "Node" | "ConfigMap" | "Secret" | "Quota" => 1,
+        "Node" | "ConfigMap" | "Secret" | "Quota" | "Site" => 1,
         _ => 2,
     };
     let priority = step.manifest.admitted.pointer("/spec/priority").and_then(Value::as_i64);
@@ -297,11 +309,10 @@ fn rank(step: &Step) -> (u8, Reverse<i64>) {
 /// reason of its own.
 async fn store(
     session: &mut Session,
-    mut steps: Vec<Step>,
+    steps: Vec<Step>,
     mode: Mode,
     output: Option<Format>,
 ) -> Result<(Vec<(Manifest, Value)>, u8), CliError> {
-    steps.sort_by_key(rank);
     let single = steps.len() == 1;
     let mut errors = FirstError::default();
     let (mut applied, mut left) = (Vec::new(), Vec::new());
@@ -327,6 +338,26 @@ async fn store(
         print(&mut session.ui, &applied, single, format)?;
     }
     Ok((applied, errors.exit()))
+}
+
+/// Says of objects that were stored together what was done.
+fn tell(
+    session: &mut Session,
+    done: Vec<(Step, Value)>,
+    output: Option<Format>,
+) -> Result<Vec<(Manifest, Value)>, CliError> {
+    let single = done.len() == 1;
+    let mut applied = Vec::new();
+    for (step, object) in done {
+        if output.is_none() {
+            session.ui.line(&sentence(&step, &object, Mode::Store))?;
+        }
+        applied.push((step.manifest, object));
+    }
+    if let Some(format) = output {
+        print(&mut session.ui, &applied, single, format)?;
+    }
+    Ok(applied)
 }
 
 /// What there is now of objects that were checked together, when somebody else came in between.

@@ -7,14 +7,14 @@ use std::time::Duration;
 
 use futures::future::join_all;
 use muster_api::condition::{ACTUATORS_FENCED, ConditionStatus};
-use muster_api::kind::node::estop::{EStopStatus, EStopTier};
+use muster_api::kind::node::estop::{EStopStatus, EStopTier, ORDERED};
 use muster_api::kind::node::{Node, NodeKind, NodeStatus};
 use serde_json::{Value, json};
 use tokio::time::Instant;
 
 use super::{FirstError, Outcome};
 use crate::client::{Client, Mode, Selection};
-use crate::error::CliError;
+use crate::error::{Class, CliError};
 use crate::session::Session;
 use crate::target;
 
@@ -95,16 +95,43 @@ async fn read(client: &Client, name: &str) -> Result<Node, CliError> {
     })
 }
 
-/// Writes what is decided. A release names the newest stop that is known: one that came after stays.
+/// Writes what is decided. A stop is written whatever else is.
 async fn order(client: &Client, name: &str, tier: EStopTier) -> Result<(), CliError> {
-    let mut spec = json!({"estop": tier});
     if tier.is_none() {
-        let status = read(client, name).await?.status.unwrap_or_default();
-        let number = status.estop.map(|estop| estop.number);
-        spec = json!({"estop": Value::Null, "estopRelease": number});
+        return release(client, name).await;
     }
-    let patch = json!({ "spec": spec });
+    let now = jiff::Timestamp::now().to_string();
+    let patch = json!({"metadata": {"annotations": {ORDERED: now}}, "spec": {"estop": tier}});
     client.patch(target::kind("node")?, None, name, &patch, Mode::Store).await.map(drop)
+}
+
+/// A release names the newest stop of the robot's own that is known, and counts only while nobody has decided anything else
+/// about the stop: one that came after stays.
+async fn release(client: &Client, name: &str) -> Result<(), CliError> {
+    let seen = read(client, name).await?;
+    let number = |node: &Node| Some(node.status.as_ref()?.estop.as_ref()?.number);
+    let decided = |node: &Node| {
+        let ordered = node.metadata.annotations.as_ref().and_then(|all| all.get(ORDERED).cloned());
+        (node.spec.estop, ordered, number(node))
+    };
+    let mut node = seen.clone();
+    loop {
+        let patch = json!({
+            "metadata": {"resourceVersion": node.metadata.resource_version},
+            "spec": {"estop": Value::Null, "estopRelease": number(&seen)},
+        });
+        match client.patch(target::kind("node")?, None, name, &patch, Mode::Store).await {
+            Err(error) if error.class() == Class::Conflict => {}
+            done => return done.map(drop),
+        }
+        node = read(client, name).await?;
+        if decided(&node) != decided(&seen) {
+            return Err(CliError::Failed {
+                what: format!("node/{name} is not released: somebody has stopped it meanwhile"),
+                hint: Some("look why, and release it then".to_owned()),
+            });
+        }
+    }
 }
 
 /// Looks until the robot says that it is so.
@@ -229,5 +256,23 @@ mod tests {
         assert!(said.contains("Cut by button on the robot"), "{said}");
         let spec = fake.object("nodes/r1").expect("there")["spec"].clone();
         assert_eq!((spec.get("estop"), &spec["estopRelease"]), (None, &json!(4)));
+    }
+
+    #[tokio::test]
+    async fn a_release_does_not_take_back_what_somebody_decides_meanwhile() {
+        let fake = Fake::new();
+        fake.put("nodes/r1", robot("r1", &json!({"tier": "None", "number": 4})));
+        let release = ["estop", "r1", "--release", "--timeout", "0s"];
+        fake.meanwhile(|node| {
+            node["metadata"]["annotations"] = json!({"muster.dev/estop-ordered": "now"})
+        });
+        let said = refused(&fake, &release).await;
+        assert!(said.contains("somebody has stopped it meanwhile"), "as far as before: {said}");
+        fake.meanwhile(|node| node["spec"]["estop"] = json!("Cut"));
+        let said = refused(&fake, &release).await;
+        assert!(said.contains("somebody has stopped it meanwhile"), "{said}");
+        assert_eq!(fake.object("nodes/r1").expect("there")["spec"]["estop"], "Cut");
+        fake.meanwhile(|node| node["metadata"]["labels"] = json!({"room": "lab"}));
+        assert_eq!(fake.run(&release).await, (exit::OK, "node/r1 released\n".to_owned()));
     }
 }

@@ -8,6 +8,7 @@ pub(crate) mod delete;
 pub(crate) mod describe;
 pub(crate) mod drain;
 pub(crate) mod estop;
+pub(crate) mod exec;
 pub(crate) mod fence;
 pub(crate) mod get;
 pub(crate) mod gone;
@@ -23,6 +24,7 @@ pub(crate) mod settle;
 pub(crate) mod simulate;
 pub(crate) mod token;
 pub(crate) mod top;
+mod transaction;
 pub(crate) mod version;
 pub(crate) mod wait;
 pub(crate) mod why;
@@ -84,6 +86,7 @@ pub(crate) async fn dispatch(command: Command, session: &mut Session) -> Outcome
         Command::Delete(args) => delete::run(args, session).await,
         Command::Scale(args) => scale::run(args, session).await,
         Command::Rollout(command) => rollout::run(command, session).await,
+        Command::Exec(args) => exec::run(args, session).await,
         Command::Logs(args) => logs::run(args, session).await,
         Command::Top(args) => top::run(args, session).await,
         Command::Wait(args) => wait::run(args, session).await,

@@ -1,4 +1,5 @@
-//! Speed of the decisions: nearest robots beside brute force, a full cycle of offers, placements over a moving fleet.
+//! Speed of the decisions: nearest robots beside brute force, a full cycle of offers, placements over a moving fleet, ways over a
+//! floor with walls.
 //!
 //! ```sh
 //! cargo bench -p muster-controller-core --bench offers
@@ -12,15 +13,17 @@ use muster_api::condition::{self, Condition, ConditionStatus};
 use muster_api::id::TaskUid;
 use muster_api::kind::framework::FrameworkSpec;
 use muster_api::kind::node::{Node, NodeKind, NodeSpec, NodeStatus, RuntimeStatus};
+use muster_api::kind::site::{SiteGrid, SiteSpec};
 use muster_api::kind::task::TaskSpec;
+use muster_api::map::{Cell, Grid};
 use muster_api::name::NodeName;
 use muster_api::pose::{OperationPosition, Pose};
 use muster_api::quantity::{Bytes, MilliCpu};
 use muster_api::resource::{Compute, parse_function_list};
 use muster_controller_core::cluster::Cluster;
-use muster_controller_core::offer::Wish;
 use muster_controller_core::offer::allocator::Closest;
 use muster_controller_core::offer::book::Book;
+use muster_controller_core::offer::{OfferId, Wish};
 use muster_controller_core::schedule::{Demand, schedule};
 use muster_controller_core::space::{Slot, Space};
 use nalgebra::Point3;
@@ -186,7 +189,7 @@ fn position(at: Point3<f64>) -> OperationPosition {
 fn cycle(robots: usize, frameworks: usize) {
     let mut numbers = Numbers(2);
     let (mut cluster, names, mut places) = fleet(robots, &mut numbers);
-    let mut book = Book::new(Box::new(Closest));
+    let mut book = Book::new(Box::new(Closest), OfferId::first(0));
     let mut seats = Vec::new();
     for i in 0..frameworks {
         let spec = FrameworkSpec {
@@ -235,6 +238,7 @@ fn decisions(robots: usize, tasks: usize) {
             spec: Arc::new(spec),
             since: 0,
             avoid: Arc::default(),
+            framework: None,
         }];
         let moved = numbers.index(robots);
         places[moved] += nalgebra::Vector3::new(0.1, 0.0, 0.0);
@@ -255,6 +259,81 @@ fn decisions(robots: usize, tasks: usize) {
     );
 }
 
+/// A building of 100 m × 100 m at 5 cm: rooms of 10 m, each with a door of 1 m to every neighbour.
+fn building() -> SiteSpec {
+    const SIDE: u32 = 2_000;
+    const ROOM: u32 = 200;
+    const DOOR: std::ops::Range<u32> = 90..110;
+    let wall = |at: u32, along: u32| at % ROOM < 2 && !DOOR.contains(&(along % ROOM));
+    let cell = |x: u32, y: u32| {
+        let rim = [x, y].into_iter().any(|at| !(2..SIDE - 2).contains(&at));
+        if rim || wall(x, y) || wall(y, x) { Cell::Occupied } else { Cell::Free }
+    };
+    let cells = (0..SIDE).flat_map(|y| (0..SIDE).map(move |x| cell(x, y))).collect();
+    let grid = Grid { width: SIDE, height: SIDE, resolution: 0.05, origin: [0.0; 3], cells };
+    SiteSpec { map: None, inflation: 0.3, map_file: None, grid: Some(SiteGrid::of(&grid)) }
+}
+
+fn travel(robots: usize, positions: usize, tasks: usize) {
+    let (mut numbers, spec) = (Numbers(4), building());
+    let (mut cluster, names, mut places) = fleet(robots, &mut numbers);
+    for (name, place) in names.iter().zip(&places) {
+        let mut node = robot(*place);
+        node.spec.speed = Some(0.5);
+        cluster.upsert_node(name, &node);
+    }
+    let start = Instant::now();
+    cluster.set_site("map", Some(&spec));
+    println!(
+        "  floor of 2000 × 2000 cells from its Site: {:.0} ms",
+        start.elapsed().as_secs_f64() * 1e3
+    );
+    // The middles of rooms: nobody works in a wall.
+    let room = |numbers: &mut Numbers| f64::from(numbers.index(10) as u32) * 10.0 + 3.0;
+    let works: Vec<OperationPosition> = (0..positions)
+        .map(|_| position(Point3::new(room(&mut numbers), room(&mut numbers), 0.0)))
+        .collect();
+    let (mut fronts, mut first) = (Duration::ZERO, Vec::new());
+    for work in &works {
+        let start = Instant::now();
+        first.push(cluster.sites().travel(work, &pose(places[0])));
+        fronts += start.elapsed();
+    }
+    black_box(&first);
+    println!("  wavefront over them: {:.0} ms", fronts.as_secs_f64() * 1e3 / positions as f64);
+    let mut spent = Duration::ZERO;
+    for i in 0..tasks {
+        let spec = serde_json::json!({
+            "placement": {"at": works[i % positions], "cost": "TravelTime", "on": "Robot"},
+            "resources": {"cpu": "100m", "memory": "64Mi", "sensors": ["kinect:ImageGen"]},
+            "run": {"process": {"command": ["true"]}},
+        });
+        let spec: TaskSpec = serde_json::from_value(spec).expect("a spec");
+        let uid = TaskUid::new(format!("way-{i}"));
+        let mut demand = [Demand {
+            uid: uid.clone(),
+            title: format!("default/way-{i}").into(),
+            spec: Arc::new(spec),
+            since: 0,
+            avoid: Arc::default(),
+            framework: None,
+        }];
+        let moved = numbers.index(robots);
+        places[moved] += nalgebra::Vector3::new(0.1, 0.0, 0.0);
+        let pose = pose(places[moved]);
+        let start = Instant::now();
+        cluster.set_pose(&names[moved], &pose);
+        let plan = schedule(&mut cluster, &mut demand);
+        spent += start.elapsed();
+        assert_eq!(plan.binds.len(), 1, "some robot can come");
+        cluster.release(&uid);
+    }
+    println!(
+        "  {robots} moving robots by travel time, {positions} places of work: {:.0} decisions/s, each of all robots",
+        tasks as f64 / spent.as_secs_f64()
+    );
+}
+
 fn main() {
     println!("{NEAREST} nearest within {RADIUS} m, half of the robots filtered out:");
     nearest(10_000, 20_000);
@@ -263,4 +342,6 @@ fn main() {
     cycle(10_000, 1_000);
     println!("placement:");
     decisions(10_000, 40_000);
+    println!("ways:");
+    travel(100, 5, 2_000);
 }

@@ -4,135 +4,28 @@
 //! It is rebuilt from the store at start and fed with every change afterwards. Feeding the same
 //! state twice changes nothing, so the scheduler's own writes may come back through the store.
 
+mod facts;
+
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::Arc;
 
 use muster_api::id::{Epoch, TaskUid};
-use muster_api::kind::lease::DEFAULT_GROUP;
-use muster_api::kind::node::upkeep::passing_taints;
-use muster_api::kind::node::{Node, NodeKind, NodeStatus, RuntimeStatus, Taint};
+use muster_api::kind::node::{Node, NodeKind};
 use muster_api::kind::quota::QuotaSpec;
-use muster_api::name::{FunctionName, NodeName};
+use muster_api::kind::site::SiteSpec;
+use muster_api::name::NodeName;
 use muster_api::pose::Pose;
 use muster_api::quantity::{Bytes, MilliCpu};
-use muster_api::selector::Labels;
+use muster_api::resource::Compute;
 
+use crate::fairness::{Accounts, Rank, Service};
 use crate::ledger::{Denied, NodeLedger, Reservation, Standing};
-use crate::recent::Recent;
+use crate::site::Sites;
 use crate::space::{Slot, Space};
 
-/// What filters need to know of a node. What is mostly the same in a fleet is shared.
-#[derive(Debug, Clone, PartialEq)]
-pub struct NodeFacts {
-    /// Robot or cloud.
-    pub kind: NodeKind,
-    /// Its labels.
-    pub labels: Labels,
-    /// Cordoned.
-    pub unschedulable: bool,
-    /// Its taints.
-    pub taints: Vec<Taint>,
-    /// Metres per second.
-    pub speed: Option<f64>,
-    /// `None`: ready; otherwise what the Ready condition says.
-    pub not_ready: Option<String>,
-    /// SR.
-    pub sensors: Arc<BTreeSet<FunctionName>>,
-    /// AR.
-    pub actuators: Arc<BTreeSet<FunctionName>>,
-    /// Where it is.
-    pub pose: Option<Pose>,
-    /// How tasks can be run.
-    pub runtimes: Arc<Vec<RuntimeStatus>>,
-    /// Taints that its conditions put on it for now.
-    pub passing: Vec<Taint>,
-    /// Percent of a full battery; none: it has none, or does not tell.
-    pub battery: Option<u8>,
-}
-
-impl NodeFacts {
-    /// The facts of one node, by itself.
-    #[must_use]
-    pub fn of(node: &Node) -> Self {
-        Models::default().facts(node)
-    }
-
-    /// The conflict groups that a task with these actuators takes: all of the robot's when it takes
-    /// any (Avalon, III-B), none when it takes none.
-    #[must_use]
-    pub fn groups_for(&self, actuators: &[FunctionName]) -> Vec<String> {
-        if actuators.is_empty() { Vec::new() } else { vec![DEFAULT_GROUP.to_owned()] }
-    }
-
-    /// Every conflict group of the robot; none when it has no actuators.
-    #[must_use]
-    pub fn groups(&self) -> Vec<String> {
-        if self.actuators.is_empty() { Vec::new() } else { vec![DEFAULT_GROUP.to_owned()] }
-    }
-
-    /// What its battery lacks of a full one, percent; nothing without a battery.
-    #[must_use]
-    pub fn battery_lacks(&self) -> u8 {
-        100_u8.saturating_sub(self.battery.unwrap_or(100))
-    }
-
-    fn same_but_for_pose(&self, other: &NodeFacts) -> bool {
-        self.kind == other.kind
-            && self.labels == other.labels
-            && self.unschedulable == other.unschedulable
-            && self.taints == other.taints
-            && self.speed == other.speed
-            && self.not_ready == other.not_ready
-            && self.sensors == other.sensors
-            && self.actuators == other.actuators
-            && is_move(self.pose.as_ref(), other.pose.as_ref())
-            && self.runtimes == other.runtimes
-            && self.passing == other.passing
-            && self.battery_lacks() / BATTERY_STEP == other.battery_lacks() / BATTERY_STEP
-    }
-}
-
-/// From one to the other the robot only moves. Localized or not decides who is offered the robot, so it is more than
-/// that.
-fn is_move(from: Option<&Pose>, to: Option<&Pose>) -> bool {
-    match (from, to) {
-        (Some(from), Some(to)) => from.map == to.map && from.localized == to.localized,
-        (from, to) => from.is_none() && to.is_none(),
-    }
-}
-
-/// What robots of one model have in common.
-#[derive(Debug, Clone, Default)]
-struct Models {
-    functions: Recent<BTreeSet<FunctionName>>,
-    runtimes: Recent<Vec<RuntimeStatus>>,
-}
-
-impl Models {
-    fn facts(&mut self, node: &Node) -> NodeFacts {
-        let nothing = NodeStatus::default();
-        let status = node.status.as_ref().unwrap_or(&nothing);
-        let not_ready = (!status.is_ready()).then(|| {
-            let said = status.condition(muster_api::condition::READY);
-            said.map_or_else(|| "its agent has not joined".to_owned(), |c| c.message.clone())
-        });
-        NodeFacts {
-            kind: node.spec.kind,
-            labels: node.metadata.labels.clone().unwrap_or_default(),
-            unschedulable: node.spec.unschedulable,
-            taints: node.spec.taints.clone(),
-            speed: node.spec.speed,
-            not_ready,
-            sensors: self.functions.share(status.sensors.iter().cloned().collect()),
-            actuators: self.functions.share(status.actuators.iter().cloned().collect()),
-            pose: status.pose.clone(),
-            runtimes: self.runtimes.share(status.runtimes.clone()),
-            passing: passing_taints(status),
-            battery: status.battery.map(|battery| battery.percent),
-        }
-    }
-}
+pub use facts::NodeFacts;
+use facts::{BATTERY_STEP, Models, is_move};
 
 /// A task that runs others for its framework: it has registered with the agent of its node.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -169,9 +62,6 @@ pub struct Member {
 /// of joining.
 type FreeKey = (NodeKind, u8, Reverse<MilliCpu>, Reverse<Bytes>, Slot);
 
-/// Batteries that differ by less are equally full, percent.
-const BATTERY_STEP: u8 = 20;
-
 /// Every node, found by name, by place and by what is free.
 #[derive(Debug, Clone, Default)]
 pub struct Cluster {
@@ -185,8 +75,17 @@ pub struct Cluster {
     space: Space,
     by_free: BTreeSet<FreeKey>,
     quotas: BTreeMap<Arc<str>, QuotaSpec>,
+    sites: Sites,
+    accounts: Accounts,
+    service: Service,
     changed: BTreeSet<Slot>,
     moved: BTreeSet<Slot>,
+    /// Nodes that have more than before, or take work again.
+    freed: BTreeSet<Slot>,
+    /// What declared tasks leave, and to whose frameworks.
+    left: BTreeMap<Slot, BTreeSet<Arc<str>>>,
+    /// Grows with everything that may give a waiting task another answer, but for live poses.
+    edition: u64,
     models: Models,
 }
 
@@ -233,10 +132,16 @@ impl Cluster {
         if member.facts.as_ref().is_none_or(|f| f.pose != facts.pose) {
             self.moved.insert(slot);
         }
+        if member.facts.as_ref() != Some(&facts) {
+            self.edition += 1;
+        }
+        self.accounts.discount_member(member);
         member.ledger.set_allocatable(allocatable);
         member.facts = Some(facts);
+        self.accounts.count_member(member);
         if !same {
             member.facts_version += 1;
+            self.freed.insert(slot);
             self.touch(slot);
         }
     }
@@ -258,6 +163,7 @@ impl Cluster {
         self.index_pose(slot, kind, Some(pose));
         if !moves {
             self.members[slot as usize].facts_version += 1;
+            self.freed.insert(slot);
             self.touch(slot);
         }
     }
@@ -284,6 +190,7 @@ impl Cluster {
         let Some(&slot) = self.slots.get(name) else { return };
         self.space.remove(slot);
         let member = &mut self.members[slot as usize];
+        self.accounts.discount_member(member);
         (member.facts, member.live_pose) = (None, false);
         self.touch(slot);
     }
@@ -293,11 +200,10 @@ impl Cluster {
         let slot = self.slot(node);
         self.unnominate(uid);
         self.placed.insert(uid.clone(), slot);
-        let ledger = &mut self.members[slot as usize].ledger;
-        match ledger.reservation(uid) {
+        match self.members[slot as usize].ledger.reservation(uid) {
             None => {
                 *self.priorities.entry(reservation.standing.priority).or_default() += 1;
-                ledger.book(uid, reservation);
+                self.write(slot, Some(uid), |ledger| ledger.book(uid, reservation));
                 self.touch(slot);
             }
             Some(present) if present.standing != reservation.standing => {
@@ -315,6 +221,7 @@ impl Cluster {
         let before = present.standing.priority;
         uncount(&mut self.priorities, before);
         *self.priorities.entry(standing.priority).or_default() += 1;
+        self.edition += 1;
         ledger.set_standing(uid, standing);
     }
 
@@ -345,6 +252,7 @@ impl Cluster {
     pub fn unnominate(&mut self, uid: &TaskUid) {
         let Some(slot) = self.nominated.remove(uid) else { return };
         if self.members[slot as usize].ledger.unkeep(uid) {
+            self.freed.insert(slot);
             self.touch(slot);
         }
     }
@@ -367,9 +275,8 @@ impl Cluster {
         reservation: Reservation,
     ) -> Result<(), Denied> {
         let priority = reservation.standing.priority;
-        let ledger = &mut self.members[slot as usize].ledger;
-        let is_new = ledger.reservation(uid).is_none();
-        ledger.reserve(uid, reservation)?;
+        let is_new = self.members[slot as usize].ledger.reservation(uid).is_none();
+        self.write(slot, Some(uid), |ledger| ledger.reserve(uid, reservation))?;
         if is_new {
             *self.priorities.entry(priority).or_default() += 1;
         }
@@ -382,12 +289,12 @@ impl Cluster {
     /// Takes back a [`Cluster::reserve`] that nobody was told of; the node is as it was before, its version too.
     pub fn undo(&mut self, uid: &TaskUid) {
         let Some(slot) = self.placed.remove(uid) else { return };
-        let member = &mut self.members[slot as usize];
+        let member = &self.members[slot as usize];
         if let Some(reservation) = member.ledger.reservation(uid) {
             uncount(&mut self.priorities, reservation.standing.priority);
         }
-        member.ledger.undo(uid);
-        member.version -= 1;
+        self.write(slot, Some(uid), |ledger| ledger.undo(uid));
+        self.members[slot as usize].version -= 1;
         self.reorder(slot);
     }
 
@@ -400,33 +307,119 @@ impl Cluster {
         holder: Option<TaskUid>,
     ) {
         let slot = self.slot(node);
-        let ledger = &mut self.members[slot as usize].ledger;
-        let before = ledger.group(group);
-        ledger.set_group(group, epoch, holder);
-        if ledger.group(group) != before {
+        let before = self.members[slot as usize].ledger.group(group);
+        self.write(slot, None, |ledger| ledger.set_group(group, epoch, holder));
+        let now = self.members[slot as usize].ledger.group(group);
+        if now != before {
+            if now.holder.is_none() {
+                self.freed.insert(slot);
+            }
             self.touch(slot);
         }
     }
 
     /// Frees what a task holds; gives the node it was on, if it held anything.
     pub fn release(&mut self, uid: &TaskUid) -> Option<NodeName> {
+        self.free(uid, |ledger| {
+            ledger.release(uid);
+        })
+    }
+
+    /// The same for a [`Cluster::reserve`] whose bind failed to be written, as far as anybody knows. The disk may have it
+    /// all the same, and the store say so later: the numbers of the grants are as before, so that its word counts then.
+    pub fn withdraw(&mut self, uid: &TaskUid) -> Option<NodeName> {
+        self.free(uid, |ledger| ledger.undo(uid))
+    }
+
+    fn free(&mut self, uid: &TaskUid, free: impl FnOnce(&mut NodeLedger)) -> Option<NodeName> {
         let slot = self.placed.remove(uid)?;
-        let member = &mut self.members[slot as usize];
-        if let Some(reservation) = member.ledger.reservation(uid) {
+        if let Some(reservation) = self.members[slot as usize].ledger.reservation(uid) {
             uncount(&mut self.priorities, reservation.standing.priority);
         }
-        member.ledger.release(uid);
+        self.write(slot, Some(uid), free);
+        let member = &mut self.members[slot as usize];
         member.executors.retain(|executor| executor.uid != *uid);
         let name = member.name.clone();
+        self.freed.insert(slot);
         self.touch(slot);
         Some(name)
+    }
+
+    /// Changes the books of a node, in what they say of `uid` and of leases, and the accounts with them.
+    fn write<T>(
+        &mut self,
+        slot: Slot,
+        uid: Option<&TaskUid>,
+        change: impl FnOnce(&mut NodeLedger) -> T,
+    ) -> T {
+        let ledger = &mut self.members[slot as usize].ledger;
+        self.accounts.discount(ledger, uid);
+        let done = change(ledger);
+        self.accounts.count(ledger, uid);
+        done
+    }
+
+    /// What every namespace has.
+    #[must_use]
+    pub fn accounts(&self) -> &Accounts {
+        &self.accounts
+    }
+
+    /// The weight of a namespace.
+    #[must_use]
+    pub fn weight(&self, namespace: &str) -> f64 {
+        self.quota(namespace).map_or(1.0, |quota| quota.weight)
+    }
+
+    /// Whose turn it is: the namespace with the least share, and of equals the one that was served less.
+    #[must_use]
+    pub fn rank(&self, namespace: &str) -> Rank {
+        self.service.rank(namespace, self.accounts.share(self, namespace))
+    }
+
+    /// A namespace was given a place by a decision of ours.
+    pub(crate) fn serve(&mut self, namespace: &str, compute: &Compute, leases: u64) {
+        let cost = self.accounts.part(compute, leases) / self.weight(namespace);
+        self.service.serve(namespace, cost);
     }
 
     /// The node has changed in something that matters to offers.
     fn touch(&mut self, slot: Slot) {
         self.members[slot as usize].version += 1;
+        self.edition += 1;
         self.changed.insert(slot);
         self.reorder(slot);
+    }
+
+    /// The same number as before: no waiting task has another answer than before, unless robots moved.
+    #[must_use]
+    pub fn edition(&self) -> u64 {
+        self.edition
+    }
+
+    /// The nodes that have more than at the last call, or take work again.
+    #[must_use = "they are told once"]
+    pub fn take_freed(&mut self) -> BTreeSet<Slot> {
+        std::mem::take(&mut self.freed)
+    }
+
+    /// Sets what declared tasks leave for now, and to frameworks of which namespaces.
+    pub fn leave(&mut self, left: BTreeMap<Slot, BTreeSet<Arc<str>>>) {
+        if self.left != left {
+            self.left = left;
+            self.edition += 1;
+        }
+    }
+
+    /// The namespaces to whose frameworks a node is left, by those that have more.
+    #[must_use]
+    pub fn left_to(&self, slot: Slot) -> Option<&BTreeSet<Arc<str>>> {
+        self.left.get(&slot)
+    }
+
+    /// The nodes that are left to somebody.
+    pub fn left(&self) -> impl Iterator<Item = Slot> {
+        self.left.keys().copied()
     }
 
     /// The nodes that changed since the last call, and those that only moved.
@@ -437,6 +430,7 @@ impl Cluster {
 
     /// Sets or removes what a namespace may have.
     pub fn set_quota(&mut self, namespace: &str, quota: Option<QuotaSpec>) {
+        self.edition += 1;
         match quota {
             Some(quota) => drop(self.quotas.insert(namespace.into(), quota)),
             None => drop(self.quotas.remove(namespace)),
@@ -452,6 +446,17 @@ impl Cluster {
     /// Every quota, by namespace.
     pub fn quotas(&self) -> impl Iterator<Item = (&Arc<str>, &QuotaSpec)> {
         self.quotas.iter()
+    }
+
+    /// Sets or removes what a Site says of its floor.
+    pub fn set_site(&mut self, name: &str, site: Option<&SiteSpec>) {
+        self.sites.set(name, site);
+    }
+
+    /// The floors of the maps that have a Site.
+    #[must_use]
+    pub fn sites(&self) -> &Sites {
+        &self.sites
     }
 
     /// Whether any namespace has a quota.

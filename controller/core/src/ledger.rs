@@ -28,6 +28,8 @@ pub struct Reservation {
     pub standing: Standing,
     /// Tasks of the namespace with the same word are not on the same node.
     pub apart: Option<Arc<str>>,
+    /// Uid of the framework that launched it; none: a declared task.
+    pub framework: Option<Arc<str>>,
 }
 
 /// What preemption asks of who holds something.

@@ -13,6 +13,7 @@
 //! | [`ledger`] | what each node has left, and who holds its actuators (invariants 1 and 2) |
 //! | [`poses`] | where every robot is now, and when that is written down |
 //! | [`space`] | which robots are nearest, without a scan |
+//! | [`site`] | how far robots have to go over a floor with walls, all at once |
 //! | [`cluster`] | the nodes with their ledgers, and the orders in which they are tried |
 //! | [`schedule`] | where a task goes, or why it goes nowhere (invariant 6) |
 //! | [`preempt`] | who is ended to make room for whom |
@@ -61,6 +62,7 @@ pub mod report;
 pub mod reschedule;
 pub mod schedule;
 pub mod simulation;
+pub mod site;
 pub mod space;
 pub mod stray;
 pub mod taskset;

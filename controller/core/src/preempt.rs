@@ -25,6 +25,7 @@ use crate::fairness::namespace_of;
 use crate::ledger::{NodeLedger, Reservation};
 use crate::report::Refusal;
 use crate::schedule::{Demand, filter, score};
+use crate::site::Sites;
 use crate::space::Slot;
 
 /// Up to this many candidates on a node every combination is looked at (4096 at most); above it they are spared one by
@@ -109,16 +110,17 @@ fn choose(cluster: &Cluster, demand: &Demand) -> Option<(Slot, Vec<TaskUid>)> {
     let nominated = cluster.nomination(&demand.uid);
     // Nobody more has to end there: no other node does less harm.
     if let Some(slot) = nominated
-        && let Some(nobody) = victims(cluster.at(slot), demand).filter(Vec::is_empty)
+        && let Some(nobody) =
+            victims(cluster.sites(), cluster.at(slot), demand).filter(Vec::is_empty)
     {
         return Some((slot, nobody));
     }
     let mut best: Option<(Harm, bool, f64, Slot, Vec<TaskUid>)> = None;
     for (slot, member) in cluster.members() {
-        let Some(victims) = victims(member, demand) else { continue };
+        let Some(victims) = victims(cluster.sites(), member, demand) else { continue };
         let harm = harm(&member.ledger, &victims);
         let facts = member.facts.as_ref().expect("a node with victims has facts");
-        let score = score::score(facts, &demand.spec).unwrap_or(0.0);
+        let score = score::score(cluster.sites(), facts, &demand.spec).unwrap_or(0.0);
         let elsewhere = nominated != Some(slot);
         let better = best.as_ref().is_none_or(|(h, e, s, ..)| {
             let order = harm.cmp(h).then(elsewhere.cmp(e)).then(score.total_cmp(s));
@@ -138,8 +140,8 @@ struct Candidate<'a> {
 }
 
 /// Who of a node ends for `demand`; none: that would not help, or is not needed.
-fn victims(member: &Member, demand: &Demand) -> Option<Vec<TaskUid>> {
-    match filter::refusal(member, demand)? {
+fn victims(sites: &Sites, member: &Member, demand: &Demand) -> Option<Vec<TaskUid>> {
+    match filter::refusal(sites, member, demand)? {
         Refusal::Exhausted { .. } | Refusal::LeaseHeld { .. } | Refusal::Kept { .. } => {}
         // What others hold is not, or not alone, what stands against it.
         _ => return None,

@@ -10,6 +10,8 @@ use muster_api::kind::task::NodeRefusal;
 use muster_api::name::FunctionName;
 use muster_api::resource::Shortage;
 
+use crate::site::NoWay;
+
 /// Why one node does not take one task.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Refusal {
@@ -97,6 +99,13 @@ pub enum Refusal {
         /// Metres allowed.
         within: f64,
     },
+    /// Over the floor of its map's Site no way leads to the operation position.
+    Unreachable {
+        /// The Site.
+        site: String,
+        /// Why.
+        why: NoWay,
+    },
     /// The robot's battery has less charge than the task asks for.
     BatteryLow {
         /// What it has, percent.
@@ -123,6 +132,11 @@ pub enum Refusal {
         /// For whom, `namespace/name`.
         title: String,
     },
+    /// It would fit, and is left for a moment to a framework.
+    Left {
+        /// The framework's namespace, which has a smaller share of the pool.
+        namespace: String,
+    },
 }
 
 impl Refusal {
@@ -147,11 +161,13 @@ impl Refusal {
             Refusal::NotLocalized => "NotLocalized",
             Refusal::OtherMap { .. } => "OtherMap",
             Refusal::OutOfRange { .. } => "OutOfRange",
+            Refusal::Unreachable { .. } => "Unreachable",
             Refusal::BatteryLow { .. } => "BatteryLow",
             Refusal::NoSpeed => "NoSpeed",
             Refusal::Exhausted { .. } => "Exhausted",
             Refusal::LeaseHeld { .. } => "LeaseHeld",
             Refusal::Kept { .. } => "KeptForAnother",
+            Refusal::Left { .. } => "LeftToFramework",
         }
     }
 
@@ -242,6 +258,15 @@ impl fmt::Display for Refusal {
                     "is {distance:.1} m from the operation position, at most {within:.1} m are allowed"
                 )
             }
+            Refusal::Unreachable { site, why: NoWay::Enclosed } => {
+                write!(f, "has no way to the operation position over the floor of site {site}")
+            }
+            Refusal::Unreachable { site, why: NoWay::WorkOffFloor } => {
+                write!(f, "has no way: the operation position is not on free floor of site {site}")
+            }
+            Refusal::Unreachable { site, why: NoWay::RobotOffFloor } => {
+                write!(f, "has no way: it is not on free floor of site {site} itself")
+            }
             Refusal::BatteryLow { percent, wanted } => {
                 write!(
                     f,
@@ -260,6 +285,10 @@ impl fmt::Display for Refusal {
                     "actuators ({group}) are held by {holder}; waits until its processes are gone"
                 )
             }
+            Refusal::Left { namespace } => write!(
+                f,
+                "is left for a moment to frameworks of namespace {namespace}, which has a smaller share"
+            ),
             Refusal::Kept { title } => {
                 write!(f, "what is left is kept for {title}, for which others are being ended")
             }

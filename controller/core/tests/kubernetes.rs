@@ -44,6 +44,7 @@ fn demand(uid: &str, spec: &Value, since: u64) -> Demand {
         spec: Arc::new(serde_json::from_value(spec).expect("a spec")),
         since,
         avoid: Arc::default(),
+        framework: None,
     }
 }
 

@@ -9,214 +9,35 @@
 //! decision after the other. What a framework is told goes into its outlet; one that does not read is cut off when its
 //! outlet is full, and nobody waits for it.
 
+mod request;
+
 use std::collections::{BTreeMap, HashMap};
 use std::sync::Arc;
 use std::time::Duration;
 
 use futures::future::join_all;
-use muster_api::id::TaskUid;
 use muster_api::kind::framework::FrameworkSpec;
-use muster_api::kind::task::{NodeRefusal, TaskSpec};
+use muster_api::kind::task::NodeRefusal;
+use muster_api::name::NodeName;
 use muster_api::wire::framework::v1 as wire;
 use muster_controller_core::cluster::Cluster;
-use muster_controller_core::fairness::Accounts;
 use muster_controller_core::node_health::Monotonic;
 use muster_controller_core::offer::allocator::Closest;
 use muster_controller_core::offer::book::Book;
 use muster_controller_core::offer::settle::{Denied, Launch, Order, Verdict};
-use muster_controller_core::offer::{Notice, OfferId, Seat, Wish};
-use muster_controller_core::schedule::Bind;
+use muster_controller_core::offer::{Notice, OfferId, Rescinded, Seat, Wish};
+use muster_controller_core::schedule::{Bind, Claim};
 use serde_json::Value;
-use tokio::sync::{mpsc, oneshot};
+use tokio::sync::oneshot;
 use tokio::time::Instant;
-use tokio_util::sync::CancellationToken;
 
+use super::RETRY;
 use super::bind;
 use crate::context::Context;
-use crate::quota::Pass;
 use crate::session::frameworks::convert;
 use crate::store::{Key, Op, Precondition, StoreError};
 
-/// Uid of a Framework object: the id of the framework.
-pub type FrameworkUid = Arc<str>;
-
-/// Where what a framework is told goes.
-#[derive(Debug, Clone)]
-pub struct Outlet {
-    /// Tells this session from a later one of the same framework.
-    session: u64,
-    events: mpsc::Sender<wire::Event>,
-    /// Cancelled when the framework does not read what it is told.
-    cut: CancellationToken,
-}
-
-impl Outlet {
-    /// An outlet of a session into `events`; `cut` ends the session.
-    #[must_use]
-    pub fn new(session: u64, events: mpsc::Sender<wire::Event>, cut: CancellationToken) -> Self {
-        Outlet { session, events, cut }
-    }
-
-    /// The session's number.
-    #[must_use]
-    pub fn session(&self) -> u64 {
-        self.session
-    }
-
-    /// Says it, or cuts the session off when it does not read. Never waits.
-    pub fn say(&self, event: wire::event::Event) {
-        let event = wire::Event { event: Some(event) };
-        if let Err(mpsc::error::TrySendError::Full(_)) = self.events.try_send(event) {
-            self.cut.cancel();
-        }
-    }
-}
-
-/// What a session asks of the desk.
-#[derive(Debug)]
-pub enum Request {
-    /// A framework is there.
-    Subscribe {
-        /// Who.
-        uid: FrameworkUid,
-        /// Its namespace and name.
-        key: Key,
-        /// What it wants.
-        spec: Box<FrameworkSpec>,
-        /// Where it hears.
-        outlet: Outlet,
-    },
-    /// It wants something else.
-    Wish {
-        /// Who.
-        uid: FrameworkUid,
-        /// What.
-        spec: Box<FrameworkSpec>,
-        /// Told after what was offered for the old wish is rescinded.
-        done: oneshot::Sender<()>,
-    },
-    /// Offers of everything, again.
-    Revive {
-        /// Who.
-        uid: FrameworkUid,
-    },
-    /// No offers.
-    Suppress {
-        /// Who.
-        uid: FrameworkUid,
-    },
-    /// Not these.
-    Decline {
-        /// Who.
-        uid: FrameworkUid,
-        /// Which.
-        offers: Vec<OfferId>,
-        /// For how long.
-        refuse: Duration,
-    },
-    /// Launches.
-    Accept {
-        /// Who.
-        uid: FrameworkUid,
-        /// The call's own id, for the Answer.
-        call: String,
-        /// Which offers it answers.
-        offers: Vec<OfferId>,
-        /// What is to run.
-        launches: Vec<Prepared>,
-        /// For how long the rest of the nodes is not wanted.
-        refuse: Duration,
-        /// That the namespace is still there when it is written.
-        guard: Option<Op>,
-    },
-    /// Its session ended. Ignored when a newer one has subscribed.
-    Leave {
-        /// Who.
-        uid: FrameworkUid,
-        /// The session's number.
-        session: u64,
-    },
-    /// It is gone for good.
-    Remove {
-        /// Who.
-        uid: FrameworkUid,
-    },
-    /// What is offered to whom.
-    Look {
-        /// Where the answer goes.
-        answer: oneshot::Sender<Vec<View>>,
-    },
-    /// Why each node is not offered to a framework.
-    Why {
-        /// Who.
-        uid: FrameworkUid,
-        /// Where the answer goes; none: it is not at the desk.
-        answer: oneshot::Sender<Option<Vec<NodeRefusal>>>,
-    },
-}
-
-/// A task that only needs its node.
-#[derive(Debug)]
-pub struct Prepared {
-    /// Its key.
-    pub key: Key,
-    /// The whole object, admitted and stamped, without a status.
-    pub object: Value,
-    /// Its spec.
-    pub spec: TaskSpec,
-    /// Its uid.
-    pub uid: TaskUid,
-    /// The offer it uses.
-    pub offer: OfferId,
-    /// Through its namespace's quota; kept until it is written or refused.
-    pub(crate) _pass: Option<Pass>,
-}
-
-/// One framework as the desk sees it.
-#[derive(Debug, Clone, serde::Serialize)]
-#[serde(rename_all = "camelCase")]
-pub struct View {
-    /// Its object's uid.
-    #[serde(serialize_with = "text")]
-    pub uid: FrameworkUid,
-    /// Its namespace.
-    pub namespace: String,
-    /// Its name.
-    pub name: String,
-    /// A session is open.
-    pub connected: bool,
-    /// It wants no offers.
-    pub suppressed: bool,
-    /// Weighted dominant share of its namespace.
-    pub share: f64,
-    /// What it is offered.
-    pub offers: Vec<OfferView>,
-}
-
-fn text<S: serde::Serializer>(uid: &FrameworkUid, serializer: S) -> Result<S::Ok, S::Error> {
-    serializer.serialize_str(uid)
-}
-
-/// One offer.
-#[derive(Debug, Clone, serde::Serialize)]
-#[serde(rename_all = "camelCase")]
-pub struct OfferView {
-    /// Its number.
-    pub id: String,
-    /// The node.
-    pub node: String,
-    /// Metres or seconds.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub score: Option<f64>,
-    /// Milliseconds since it was made.
-    pub age_ms: u64,
-    /// Free CR that it shows.
-    pub free: muster_api::resource::Compute,
-    /// The robot's actuators are free.
-    pub actuators: bool,
-    /// How many other frameworks are shown the node.
-    pub shared_with: usize,
-}
+pub use request::{Depth, FrameworkUid, OfferView, Outlet, Prepared, Request, View};
 
 #[derive(Debug)]
 struct Guest {
@@ -229,6 +50,7 @@ struct Guest {
 #[derive(Debug)]
 struct Pending {
     uid: FrameworkUid,
+    session: u64,
     call: String,
     launches: Vec<Prepared>,
     guard: Option<Op>,
@@ -247,46 +69,93 @@ pub(super) struct Desk {
     next_ticket: u64,
     /// To be told when what they asked for has been done and said.
     told: Vec<oneshot::Sender<()>>,
+    /// Accepts whose write seemed to fail.
+    unsure: Vec<Unsure>,
     started: Instant,
+}
+
+/// An Accept whose write seemed to fail: nobody knows yet whether the disk has it, so it has no answer yet. A framework that was
+/// told to try again would launch everything twice.
+#[derive(Debug)]
+struct Unsure {
+    seat: Seat,
+    pending: Pending,
+    binds: Vec<Bind>,
+}
+
+impl Guest {
+    /// Where a session hears; none when it is not the present one any more: its answers are no later one's.
+    fn outlet_of(&self, session: u64) -> Option<&Outlet> {
+        self.outlet.as_ref().filter(|outlet| outlet.session == session)
+    }
 }
 
 impl Desk {
     pub(super) fn new(context: Arc<Context>) -> Self {
         Desk {
             context,
-            book: Book::new(Box::new(Closest)),
+            book: Book::new(Box::new(Closest), OfferId::first(a_life())),
             guests: BTreeMap::new(),
             seats: HashMap::new(),
             pending: HashMap::new(),
             verdicts: Vec::new(),
             next_ticket: 1,
             told: Vec::new(),
+            unsure: Vec::new(),
             started: Instant::now(),
         }
+    }
+
+    /// Whether there are Accepts of which nobody knows whether they are written.
+    pub(super) fn is_unsure(&self) -> bool {
+        !self.unsure.is_empty()
+    }
+
+    /// The store knows now what it has: answers those Accepts. Gives the nodes on which nothing was launched after all.
+    pub(super) fn resolve(&mut self, cluster: &mut Cluster) -> Vec<NodeName> {
+        let mut freed = Vec::new();
+        for Unsure { seat, pending, binds } in std::mem::take(&mut self.unsure) {
+            let is_there = |prepared: &Prepared| {
+                let stored = self.context.store.get(&prepared.key);
+                stored.is_some_and(|stored| *stored.uid == *prepared.uid.as_str())
+            };
+            // One transaction: all of it is there, or nothing. What ended meanwhile is there until it is acknowledged.
+            let outlet = self.guests.get(&seat).and_then(|g| g.outlet_of(pending.session));
+            if pending.launches.iter().any(is_there) {
+                launched_all(outlet, pending, &binds);
+            } else {
+                freed.extend(binds.iter().filter_map(|bind| cluster.withdraw(&bind.uid)));
+                refuse(outlet, pending.call, convert::unavailable());
+            }
+        }
+        freed
     }
 
     fn now(&self) -> Monotonic {
         self.started.elapsed()
     }
 
-    /// The cluster was made anew, and its nodes have other numbers: every offer ends, and fresh ones follow.
-    pub(super) fn begin_anew(&mut self) {
-        let old = std::mem::replace(&mut self.book, Book::new(Box::new(Closest)));
+    /// The cluster was made anew, and its nodes have other numbers: every offer ends, and fresh ones follow. What was declined
+    /// stays declined.
+    pub(super) fn begin_anew(&mut self, before: &Cluster, cluster: &Cluster) {
+        // No number means two nodes: an Accept may be under way.
+        let next = Book::new(Box::new(Closest), self.book.next_offer());
+        let old = std::mem::replace(&mut self.book, next);
         let guests = std::mem::take(&mut self.guests);
         self.seats.clear();
         for (_, pending) in self.pending.drain() {
-            let outlet =
-                guests.values().find(|g| g.uid == pending.uid).and_then(|g| g.outlet.as_ref());
+            let guest = guests.values().find(|guest| guest.uid == pending.uid);
+            let outlet = guest.and_then(|guest| guest.outlet_of(pending.session));
             refuse(outlet, pending.call, convert::unavailable());
         }
         for (seat, guest) in guests {
             let Some(wish) = old.wish(seat) else { continue };
             let offers: Vec<String> = old.offers_of(seat).map(|o| o.id.to_string()).collect();
-            if let Some(outlet) = guest.outlet.as_ref().filter(|_| !offers.is_empty()) {
-                let reason = wire::RescindReason::Changed.into();
-                outlet.say(wire::event::Event::Rescind(wire::Rescind { offers, reason }));
+            if let Some(outlet) = &guest.outlet {
+                rescind(outlet, offers, Rescinded::Changed);
             }
             let anew = self.book.register(wish.clone());
+            self.book.refuse_still(cluster, anew, old.refusals(before, seat));
             if old.is_suppressed(seat) {
                 self.book.suppress(anew);
             }
@@ -298,8 +167,8 @@ impl Desk {
         }
     }
 
-    /// What namespaces may have has changed.
-    pub(super) fn quotas_changed(&mut self) {
+    /// What namespaces may have has changed, or the floor of a site.
+    pub(super) fn look_at_all(&mut self) {
         self.book.look_at_all();
     }
 
@@ -328,8 +197,9 @@ impl Desk {
                     drop(self.book.decline(cluster, *seat, &offers, (refuse, now)));
                 }
             }
-            Request::Accept { uid, call, offers, launches, refuse, guard } => {
-                self.accept(cluster, Pending { uid, call, launches, guard }, (offers, refuse));
+            Request::Accept { uid, session, call, offers, launches, refuse, guard } => {
+                let pending = Pending { uid, session, call, launches, guard };
+                self.accept(cluster, pending, (offers, refuse));
             }
             Request::Leave { uid, session } => {
                 let Some(seat) = self.seats.get(&uid).copied() else { return };
@@ -348,7 +218,7 @@ impl Desk {
                 }
             }
             // Nobody waits for an answer any more when its receiver is gone; that is no fault.
-            Request::Look { answer } => drop(answer.send(self.look(cluster))),
+            Request::Look { depth, answer } => drop(answer.send(self.look(cluster, depth))),
             Request::Why { uid, answer } => drop(answer.send(self.why(cluster, &uid))),
         }
     }
@@ -395,6 +265,7 @@ impl Desk {
                 .into(),
                 spec: Arc::new(prepared.spec.clone()),
                 offer: prepared.offer,
+                framework: Arc::clone(&pending.uid),
             })
             .collect();
         let ticket = self.next_ticket;
@@ -403,6 +274,18 @@ impl Desk {
         let order = Order { seat, ticket, offers, launches, refuse: refuse_for };
         let now = self.now();
         self.verdicts.extend(self.book.submit(cluster, order, now));
+    }
+
+    /// Before declared tasks are looked at: settles what is due, and says in the cluster what they leave to frameworks.
+    /// `anybody_waits`: there are declared tasks without a place.
+    pub(super) fn begin_pass(&mut self, cluster: &mut Cluster, anybody_waits: bool) {
+        let now = self.now();
+        self.verdicts.extend(self.book.begin_pass(cluster, anybody_waits, now));
+    }
+
+    /// Takes in what declared tasks leave to frameworks by the last decision.
+    pub(super) fn claim(&mut self, claims: &[Claim]) {
+        self.book.claim(claims);
     }
 
     /// Settles what is due, writes what was granted, and tells everybody what changed. Says when to work again even if
@@ -423,7 +306,9 @@ impl Desk {
             // A session that has ended meanwhile need not be told.
             let _ = done.send(());
         }
-        self.book.next_deadline().map(|at| self.started + at)
+        let unsure = (!self.unsure.is_empty()).then(|| Instant::now() + RETRY);
+        let due = self.book.next_deadline().map(|at| self.started + at);
+        due.into_iter().chain(unsure).min()
     }
 
     async fn carry_out(&mut self, cluster: &mut Cluster, verdicts: Vec<(Order, Verdict)>) {
@@ -444,21 +329,24 @@ impl Desk {
         let _nodes_stay = self.context.placing.read().await;
         let store = &self.context.store;
         let results = join_all(transactions.into_iter().map(|ops| async move {
+            let ops = ops?;
             if ops.is_empty() { Ok(Vec::new()) } else { store.apply(ops).await }
         }))
         .await;
         for ((seat, pending, binds), result) in passed.into_iter().zip(results) {
-            let outlet = self.guests.get(&seat).and_then(|g| g.outlet.as_ref());
+            let outlet = self.guests.get(&seat).and_then(|g| g.outlet_of(pending.session));
             match result {
-                Ok(_) => {
-                    metrics::counter!("muster_framework_launches_total")
-                        .increment(binds.len() as u64);
-                    let launched = pending.launches.iter().zip(&binds).map(launched).collect();
-                    answer(outlet, wire::Answer { id: pending.call, refusal: None, launched });
-                }
-                Err(error) => {
+                Ok(_) => launched_all(outlet, pending, &binds),
+                Err(error) if crate::objects::is_race(&error) => {
                     release(cluster, binds.iter());
                     refuse(outlet, pending.call, not_written(&pending.launches, &error));
+                }
+                Err(error) => {
+                    tracing::warn!(
+                        error = crate::app::chain(&error),
+                        "an Accept is not written, as it seems"
+                    );
+                    self.unsure.push(Unsure { seat, pending, binds });
                 }
             }
         }
@@ -466,12 +354,16 @@ impl Desk {
 
     fn deny(&self, seat: Seat, pending: Pending, denied: &Denied) {
         metrics::counter!("muster_framework_refusals_total").increment(1);
-        let outlet = self.guests.get(&seat).and_then(|g| g.outlet.as_ref());
+        let outlet = self.guests.get(&seat).and_then(|g| g.outlet_of(pending.session));
         refuse(outlet, pending.call, convert::denied(denied));
     }
 
     /// Tasks and leases of an Accept, as one transaction.
-    fn launch_ops(&self, pending: &Pending, binds: &[Bind]) -> Vec<Op> {
+    ///
+    /// # Errors
+    ///
+    /// As [`bind::grants`].
+    fn launch_ops(&self, pending: &Pending, binds: &[Bind]) -> Result<Vec<Op>, StoreError> {
         let now = self.context.clock.now();
         let mut ops = Vec::with_capacity(1 + 2 * binds.len());
         ops.extend(pending.guard.clone().filter(|_| !binds.is_empty()));
@@ -484,19 +376,18 @@ impl Desk {
                 value,
                 precondition: Precondition::Absent,
             });
-            ops.extend(bind::grants(&self.context, bound, &prepared.key, now));
+            ops.extend(bind::grants(&self.context.store, bound, &prepared.key, now)?);
         }
-        ops
+        Ok(ops)
     }
 
-    fn look(&self, cluster: &Cluster) -> Vec<View> {
+    fn look(&self, cluster: &Cluster, depth: Depth) -> Vec<View> {
         if self.guests.is_empty() {
             return Vec::new();
         }
-        let (accounts, now) = (Accounts::of(cluster), self.now());
-        let offer_view = |seat: Seat, offer: &muster_controller_core::offer::Offer| {
+        let (accounts, now) = (cluster.accounts(), self.now());
+        let offer_view = |offer: &muster_controller_core::offer::Offer| {
             let member = cluster.at(offer.slot);
-            let others = self.seats.values().filter(|s| **s != seat);
             OfferView {
                 id: offer.id.to_string(),
                 node: member.name.to_string(),
@@ -505,15 +396,14 @@ impl Desk {
                     .unwrap_or(u64::MAX),
                 free: member.ledger.open(),
                 actuators: muster_controller_core::offer::allocator::actuators_free(member),
-                shared_with: others
-                    .filter(|s| self.book.offers_of(**s).any(|o| o.slot == offer.slot))
-                    .count(),
+                shared_with: self.book.shown_to(offer.slot).saturating_sub(1),
             }
         };
         let view = |(seat, guest): (&Seat, &Guest)| {
             let namespace = guest.key.namespace().unwrap_or_default();
-            let mut offers: Vec<OfferView> =
-                self.book.offers_of(*seat).map(|o| offer_view(*seat, o)).collect();
+            let offered = self.book.offers_of(*seat).count();
+            let shown = self.book.offers_of(*seat).filter(|_| depth == Depth::Offers);
+            let mut offers: Vec<OfferView> = shown.map(offer_view).collect();
             offers.sort_by(|a, b| {
                 let key = |o: &OfferView| o.score.unwrap_or(f64::INFINITY);
                 key(a).total_cmp(&key(b)).then_with(|| a.node.cmp(&b.node))
@@ -525,6 +415,7 @@ impl Desk {
                 connected: guest.outlet.is_some(),
                 suppressed: self.book.is_suppressed(*seat),
                 share: accounts.share(cluster, namespace),
+                offered,
                 offers,
             }
         };
@@ -534,7 +425,7 @@ impl Desk {
     fn why(&self, cluster: &Cluster, uid: &FrameworkUid) -> Option<Vec<NodeRefusal>> {
         let seat = *self.seats.get(uid)?;
         let reasons = self.book.explain(cluster, seat, self.now());
-        let refusal = |(node, why): (muster_api::name::NodeName, _)| {
+        let refusal = |(node, why): (NodeName, _)| {
             let why: muster_controller_core::offer::explain::NotOffered = why;
             NodeRefusal {
                 node: node.to_string(),
@@ -548,8 +439,15 @@ impl Desk {
 
 fn release<'a>(cluster: &mut Cluster, binds: impl Iterator<Item = &'a Bind>) {
     for bind in binds {
-        cluster.release(&bind.uid);
+        cluster.withdraw(&bind.uid);
     }
+}
+
+/// Everything of an Accept is written.
+fn launched_all(outlet: Option<&Outlet>, pending: Pending, binds: &[Bind]) {
+    metrics::counter!("muster_framework_launches_total").increment(binds.len() as u64);
+    let launched = pending.launches.iter().zip(binds).map(launched).collect();
+    answer(outlet, wire::Answer { id: pending.call, refusal: None, launched });
 }
 
 fn launched((prepared, bind): (&Prepared, &Bind)) -> wire::Launched {
@@ -561,8 +459,7 @@ fn launched((prepared, bind): (&Prepared, &Bind)) -> wire::Launched {
 }
 
 fn answer(outlet: Option<&Outlet>, answer: wire::Answer) {
-    // A call without an id wants no answer.
-    if let Some(outlet) = outlet.filter(|_| !answer.id.is_empty()) {
+    if let Some(outlet) = outlet.filter(|_| convert::is_wanted(&answer)) {
         outlet.say(wire::event::Event::Answer(answer));
     }
 }
@@ -578,14 +475,24 @@ fn tell(guest: &Guest, cluster: &Cluster, now: jiff::Timestamp, notice: &Notice)
         ended.entry(*why).or_default().push(id.to_string());
     }
     for (why, offers) in ended {
-        let reason = convert::rescinded(why).into();
-        outlet.say(wire::event::Event::Rescind(wire::Rescind { offers, reason }));
+        rescind(outlet, offers, why);
     }
-    if !notice.offered.is_empty() {
-        let offer = |o| convert::offer((&guest.uid, o), cluster, now);
-        let offers = notice.offered.iter().map(offer).collect();
+    let offers = notice.offered.iter().map(|o| convert::offer((&guest.uid, o), cluster, now));
+    for offers in convert::parts(offers, prost::Message::encoded_len) {
         outlet.say(wire::event::Event::Offers(wire::Offers { offers }));
     }
+}
+
+fn rescind(outlet: &Outlet, offers: Vec<String>, why: Rescinded) {
+    let reason = convert::rescinded(why).into();
+    for offers in convert::parts(offers, String::len) {
+        outlet.say(wire::event::Event::Rescind(wire::Rescind { offers, reason }));
+    }
+}
+
+/// What tells the offers of this life of the controller from those of others.
+fn a_life() -> u32 {
+    uuid::Uuid::new_v4().as_fields().0
 }
 
 /// Why a granted Accept is not stored after all.
@@ -601,3 +508,6 @@ fn not_written(launches: &[Prepared], error: &StoreError) -> wire::Refusal {
     tracing::warn!(error = crate::app::chain(error), "an Accept is not written");
     convert::unavailable()
 }
+
+#[cfg(test)]
+mod tests;

@@ -8,16 +8,20 @@
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::Arc;
+use std::time::Duration;
 
+use serde::Deserialize;
 use serde_json::Value;
 
 use super::{again, next_events, watch_from_now};
 use crate::context::Context;
-use crate::rest::delete::delete_object;
+use crate::rest::delete::{delete_object, waits_for_others};
 use crate::store::{Change, Key, StoreError, Stored, UpdateError};
 
 const FOREGROUND: &str = "foregroundDeletion";
 const ORPHAN: &str = "orphan";
+/// Between two rounds while deletions wait: one round for the writes of so long, and not one for each.
+const PAUSE: Duration = Duration::from_millis(100);
 
 #[derive(Debug, Default)]
 struct Graph {
@@ -48,7 +52,7 @@ impl Graph {
         }
         self.live.insert(stored.uid.clone(), stored.key.clone());
         if stored.mentions("ownerReferences") {
-            let owners = owner_uids(&stored.value());
+            let owners = owner_uids(stored);
             for owner in &owners {
                 self.dependents.entry(owner.clone()).or_default().insert(stored.key.clone());
             }
@@ -65,7 +69,7 @@ impl Graph {
     /// Whether the object is there and still names the owners that are known here: events may be on their way that say
     /// whom it belongs to now.
     fn is_present(&self, context: &Context, key: &Key) -> bool {
-        let present = context.store.get(key).map(|stored| owner_uids(&stored.value()));
+        let present = context.store.get(key).map(|stored| owner_uids(&stored));
         present.as_ref().is_some_and(|owners| self.owners.get(key) == Some(owners))
     }
 
@@ -76,9 +80,27 @@ impl Graph {
     }
 }
 
-fn owner_uids(object: &Value) -> BTreeSet<String> {
-    let references = object.pointer("/metadata/ownerReferences").and_then(Value::as_array);
-    references.into_iter().flatten().filter_map(|r| r["uid"].as_str().map(str::to_owned)).collect()
+/// The part of an object that names its owners.
+#[derive(Deserialize)]
+struct Belonging {
+    metadata: Belongs,
+}
+
+#[derive(Deserialize)]
+#[serde(rename_all = "camelCase")]
+struct Belongs {
+    #[serde(default)]
+    owner_references: Option<Vec<Reference>>,
+}
+
+#[derive(Deserialize)]
+struct Reference {
+    uid: Option<String>,
+}
+
+fn owner_uids(stored: &Stored) -> BTreeSet<String> {
+    let references = stored.parse::<Belonging>().ok().and_then(|o| o.metadata.owner_references);
+    references.into_iter().flatten().filter_map(|reference| reference.uid).collect()
 }
 
 /// Works until dropped.
@@ -103,6 +125,10 @@ async fn follow(context: &Context) -> Result<(), StoreError> {
         }
         for (key, uid) in graph.waiting.clone() {
             finish(context, &graph, &key, &uid).await?;
+        }
+        if !graph.waiting.is_empty() {
+            // Each round looks at all that an ending object waits for.
+            tokio::time::sleep(PAUSE).await;
         }
         let Some(events) = next_events(&mut watcher).await else { return Ok(()) };
         for event in &events {
@@ -141,8 +167,9 @@ async fn finish(context: &Context, graph: &Graph, key: &Key, uid: &str) -> Resul
     }
     let mut left = 0;
     for dependent in dependents {
-        if context.store.get(dependent).is_some() {
-            left += 1;
+        let Some(stored) = context.store.get(dependent) else { continue };
+        left += 1;
+        if !waits_for_others(&stored) {
             drop(delete_object(context, dependent).await);
         }
     }

@@ -4,6 +4,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use jiff::Timestamp;
+use serde::Deserialize;
 
 use crate::context::Context;
 use crate::objects::EVENTS;
@@ -17,16 +18,34 @@ const EVERY: Duration = Duration::from_secs(60);
 /// which a reconnecting client needs; at rest it is days.
 const KEEP_REVISIONS: u64 = 10_000;
 
+/// When an Event last happened.
+#[derive(Deserialize)]
+#[serde(rename_all = "camelCase")]
+struct Dated {
+    last_timestamp: Option<String>,
+    metadata: Made,
+}
+
+#[derive(Deserialize)]
+#[serde(rename_all = "camelCase")]
+struct Made {
+    creation_timestamp: Option<String>,
+}
+
+impl Dated {
+    fn stamp(&self) -> Option<Timestamp> {
+        let stamps = [&self.last_timestamp, &self.metadata.creation_timestamp];
+        stamps.into_iter().flatten().find_map(|text| text.parse().ok())
+    }
+}
+
 /// Works until dropped.
 pub async fn run(context: Arc<Context>) {
     loop {
         tokio::time::sleep(EVERY).await;
         let now = context.clock.now();
         for stored in context.store.list(EVENTS, None).items {
-            let value = stored.value();
-            let stamp = ["/lastTimestamp", "/metadata/creationTimestamp"]
-                .iter()
-                .find_map(|p| value.pointer(p)?.as_str()?.parse::<Timestamp>().ok());
+            let stamp = stored.parse::<Dated>().ok().and_then(|event| event.stamp());
             let old = stamp.is_none_or(|s| now.duration_since(s).unsigned_abs() > EVENT_LIFE);
             if old
                 && let Err(error) = context

@@ -1,5 +1,5 @@
 //! Level-triggered loops: each looks at what is and does what is missing. None depends on having
-//! seen an event; after a restart each begins by looking at everything.
+//! seen an event; after a restart each begins by looking at everything. One that panics ends the process.
 //!
 //! | loop | looks at | does |
 //! |---|---|---|
@@ -18,6 +18,7 @@
 //! | [`application`] | Applications, Nodes | writes which parts may move, and where; nothing moves them yet |
 //! | [`upkeep`] | Nodes with batteries and maintenance windows | says when nothing new begins there, ends what is to be gone |
 //! | [`orders`] | Nodes | tells their agents of emergency stops |
+//! | [`images`] | TaskSets | tells agents which images rollouts want on their nodes |
 //! | [`deletion`] | Tasks being deleted | removes those whose processes are gone |
 //! | [`garbage`] | ownerReferences | deletes what lost its owner |
 //! | [`history`] | Events, the store's history | forgets what is old |
@@ -33,6 +34,7 @@ pub mod failover;
 pub mod garbage;
 pub mod health;
 pub mod history;
+pub mod images;
 mod moves;
 pub mod orders;
 mod preempt;
@@ -48,6 +50,7 @@ use std::time::Duration;
 
 use tokio_util::task::TaskTracker;
 
+use crate::app::guard;
 use crate::context::Context;
 use crate::session::Sessions;
 use crate::session::frameworks::{Frameworks, updates};
@@ -80,12 +83,12 @@ pub fn spawn(
     let loops = context.stop.clone();
     let run = |name: &'static str, work: std::pin::Pin<Box<dyn Future<Output = ()> + Send>>| {
         let stop = loops.clone();
-        tasks.spawn(async move {
+        tasks.spawn(guard(Arc::clone(context), name, async move {
             tokio::select! {
                 () = stop.cancelled() => {}
                 () = work => tracing::debug!(name, "loop ended"),
             }
-        });
+        }));
     };
     run("schedule", Box::pin(scheduler.run()));
     run("books", Box::pin(books::run(Arc::clone(context), books)));
@@ -100,6 +103,7 @@ pub fn spawn(
     run("application", Box::pin(application::run(Arc::clone(context))));
     run("upkeep", Box::pin(upkeep::run(Arc::clone(context))));
     run("orders", Box::pin(orders::run(Arc::clone(context), Arc::clone(sessions))));
+    run("images", Box::pin(images::run(Arc::clone(context), Arc::clone(sessions))));
     run("history", Box::pin(history::run(Arc::clone(context))));
     run("board", Box::pin(crate::session::board::run(Arc::clone(context), Arc::clone(sessions))));
     run("poses", Box::pin(poses::run(Arc::clone(context), Arc::clone(poses))));
@@ -115,8 +119,10 @@ pub fn spawn_for_frameworks(
 ) {
     let failover = failover::run(Arc::clone(context), Arc::clone(frameworks));
     let updates = updates::run(Arc::clone(context), Arc::clone(frameworks));
-    tasks.spawn(context.stop.clone().run_until_cancelled_owned(failover));
-    tasks.spawn(context.stop.clone().run_until_cancelled_owned(updates));
+    let failover = context.stop.clone().run_until_cancelled_owned(failover);
+    tasks.spawn(guard(Arc::clone(context), "failover", failover));
+    let updates = context.stop.clone().run_until_cancelled_owned(updates);
+    tasks.spawn(guard(Arc::clone(context), "updates", updates));
 }
 
 /// Follows the store, again each time when `follow` ends because it must begin anew; when the store failed, after a

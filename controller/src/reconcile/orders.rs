@@ -1,5 +1,5 @@
-//! Tells agents what people decide about their nodes: emergency stops and their releases. A session begins with them; this
-//! says what changes afterwards, at once.
+//! Tells agents what people decide about their nodes: emergency stops and their releases. A stream of orders begins with them;
+//! this says what changes afterwards, at once.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -15,6 +15,9 @@ use crate::objects::{self, NODES};
 use crate::session::Sessions;
 use crate::store::{Change, Stored};
 
+/// What no node orders: what its agent was told is not known.
+const UNKNOWN: wire::NodeOrder = wire::NodeOrder { estop_tier: u32::MAX, estop_release: 0 };
+
 /// Works until dropped.
 pub async fn run(context: Arc<Context>, sessions: Arc<Sessions>) {
     loop {
@@ -28,13 +31,22 @@ async fn follow(context: &Context, sessions: &Sessions) {
     // Only orders that order something are kept: most nodes have none.
     let mut told: HashMap<Arc<str>, wire::NodeOrder> = HashMap::new();
     for stored in &context.store.list(NODES, None).items {
+        // What was ordered before may be over.
+        if node_name(stored).is_some_and(|name| sessions.orders().is_heard(&name)) {
+            told.insert(stored.key.name.clone(), UNKNOWN);
+        }
         tell(sessions, &mut told, stored);
     }
     while let Some(events) = next_events(&mut watcher).await {
         for event in events.iter().filter(|event| event.object.key.resource == NODES) {
             match event.change {
                 Change::Put => tell(sessions, &mut told, &event.object),
-                Change::Delete => drop(told.remove(&event.object.key.name)),
+                Change::Delete => {
+                    told.remove(&event.object.key.name);
+                    if let Some(name) = node_name(&event.object) {
+                        sessions.orders().end(&name);
+                    }
+                }
             }
         }
     }
@@ -57,12 +69,11 @@ fn tell(sessions: &Sessions, told: &mut HashMap<Arc<str>, wire::NodeOrder>, stor
     } else {
         told.insert(stored.key.name.clone(), order);
     }
-    let Ok(name) = NodeName::new(stored.key.name.to_string()) else { return };
-    if let Some(connection) = sessions.connection(&name) {
-        let body = Some(wire::controller_message::Body::Order(order));
-        // An agent that does not read must not keep a stop from the others. Its next session begins with it.
-        if connection.outbound.try_send(wire::ControllerMessage { body }).is_err() {
-            sessions.kick(&name);
-        }
+    if let Some(name) = node_name(stored) {
+        sessions.orders().say(&name, stored.revision, order);
     }
+}
+
+fn node_name(stored: &Stored) -> Option<NodeName> {
+    NodeName::new(stored.key.name.to_string()).ok()
 }

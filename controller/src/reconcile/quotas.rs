@@ -10,7 +10,6 @@ use std::time::Duration;
 
 use muster_api::kind::quota::{QUOTA_NAME, Quota, QuotaStatus};
 use muster_controller_core::cluster::Cluster;
-use muster_controller_core::fairness::Accounts;
 use tokio::sync::Notify;
 use tokio::time::Instant;
 
@@ -74,7 +73,7 @@ impl Counter {
             return Some(self.next);
         }
         (self.stale, self.next) = (false, now + EVERY);
-        self.counts.put(Accounts::of(cluster).of_quotas(cluster));
+        self.counts.put(cluster.accounts().of_quotas(cluster));
         None
     }
 }

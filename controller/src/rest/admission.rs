@@ -1,5 +1,6 @@
 //! What is refused before it is stored, and fields that no kind has.
 
+use bytes::Bytes;
 use http::HeaderValue;
 use muster_api::kind;
 use muster_api::validate::{Violation, ViolationKind, Violations};
@@ -8,12 +9,36 @@ use serde_json::Value;
 use super::failure::Failure;
 use super::query::FieldValidation;
 use super::registry::Entry;
+use crate::store::{DEEPEST, LARGEST, is_deeper};
+
+/// Bytes of all warnings together: as much as Kubernetes sends, and as clients and proxies take of headers.
+const WARNINGS: usize = 4 << 10;
 
 /// An object that may be stored, and what the client should hear about it.
 #[derive(Debug)]
 pub(super) struct Admitted {
     pub(super) object: Value,
     pub(super) warnings: Vec<HeaderValue>,
+}
+
+/// Refuses what would be too deep to be read again.
+pub(super) fn check_depth(object: &Value) -> Result<(), Failure> {
+    match is_deeper(object, DEEPEST) {
+        true => Err(Failure::bad_request(format!(
+            "more than {DEEPEST} lists and objects lie in each other in the object"
+        ))),
+        false => Ok(()),
+    }
+}
+
+/// An object that is only shown as it would be stored; refused where the store would refuse it.
+pub(super) fn render(object: &Value) -> Result<Bytes, Failure> {
+    check_depth(object)?;
+    let text = object.to_string();
+    match text.len() > LARGEST {
+        true => Err(Failure::bad_request(format!("the object is larger than {LARGEST} bytes"))),
+        false => Ok(text.into()),
+    }
 }
 
 /// Checks that the body is an object of the kind that the path names, and fills in what it leaves out.
@@ -45,20 +70,26 @@ pub(super) fn admit(
     object: Value,
     mode: FieldValidation,
 ) -> Result<Admitted, Failure> {
+    check_depth(&object)?;
     let violations = match kind::admit(&object) {
         Ok(object) => return Ok(Admitted { object, warnings: Vec::new() }),
         Err(violations) => violations,
     };
     let refused = |violations: &Violations| Failure::invalid(entry, name, violations);
-    if mode == FieldValidation::Strict || !violations.iter().any(is_unknown_field) {
+    // Of more than are told nobody can drop every one.
+    let droppable = violations.iter().any(is_unknown_field) && !violations.is_full();
+    if mode == FieldValidation::Strict || !droppable {
         return Err(refused(&violations));
     }
     let mut object = object;
-    let mut warnings = Vec::new();
+    let (mut warnings, mut length) = (Vec::new(), 0);
     for unknown in violations.iter().filter(|violation| is_unknown_field(violation)) {
         remove(&mut object, &unknown.path);
-        let text = format!("299 - \"unknown field {:?}\"", unknown.path).replace("\\\"", "'");
+        // A text in quotes, in which quotes are escaped.
+        let text = format!("299 - {:?}", format!("unknown field {:?}", unknown.path));
+        length += text.len();
         if mode == FieldValidation::Warn
+            && length <= WARNINGS
             && let Ok(value) = HeaderValue::try_from(text)
         {
             warnings.push(value);

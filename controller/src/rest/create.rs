@@ -1,9 +1,12 @@
 //! POST: new objects.
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use axum::response::Response;
 use http::{HeaderValue, StatusCode, header};
+use muster_api::kind::namespace::DEFAULT;
+use muster_api::kind::quota::{QUOTA_NAME, QuotaSpec};
 use muster_api::kind::task::Resources;
 use muster_api::validate::Violations;
 use serde::Deserialize as _;
@@ -13,10 +16,10 @@ use super::path::Object;
 use super::query::FieldValidation;
 use super::registry::Entry;
 use super::update::Options;
-use super::{Answer, Call, admission, body, failure::Failure, metadata, namespace};
+use super::{Answer, Call, admission, body, failure::Failure, metadata, namespace, together};
 use crate::context::Context;
 use crate::depends;
-use crate::objects::TASKS;
+use crate::objects::{self, TASKS};
 use crate::quota::{self, Pass};
 use crate::store::{Op, Precondition, Resource, StoreError, Stored};
 
@@ -35,7 +38,8 @@ pub(super) async fn create(call: Call, target: Object) -> Answer {
     let (parts, body) = request.into_parts();
     let object = body::json(&parts.headers, body).await?;
     let namespace = target.namespace.as_deref();
-    let request = New { entry: target.entry, namespace, mode, dry, owners: None };
+    let with = With::default();
+    let request = New { entry: target.entry, namespace, mode, dry, owners: None, with };
     let (bytes, warnings) = store_new(&context, &request, object).await?;
     Ok(with_warnings(super::raw(StatusCode::CREATED, bytes), warnings))
 }
@@ -53,6 +57,7 @@ pub(super) async fn by_application(
         mode: options.mode,
         dry: options.dry,
         owners: object["metadata"].get("managedFields").cloned(),
+        with: With::default(),
     };
     let (bytes, warnings) = store_new(context, &new, object).await?;
     Ok(with_warnings(super::raw(StatusCode::CREATED, bytes), warnings))
@@ -67,19 +72,19 @@ pub async fn create_object(
     resource: Resource,
     object: Value,
 ) -> Result<Arc<Stored>, Failure> {
+    let namespace = metadata::text(&object, "namespace").map(str::to_owned);
+    let new = ours(resource, namespace.as_deref())?;
+    let prepared = prepare(context, &new, object)?;
+    let _pass = pass(context, new.entry.resource, &prepared.object)?;
+    commit(context, &new, prepared).await.map(|(stored, _)| stored)
+}
+
+/// What the controller itself makes, held to every rule.
+fn ours(resource: Resource, namespace: Option<&str>) -> Result<New<'_>, Failure> {
     let entry = super::registry::of(resource)
         .ok_or_else(|| Failure::internal(format!("{resource} is not served")))?;
-    let namespace = metadata::text(&object, "namespace").map(str::to_owned);
-    let new = New {
-        entry,
-        namespace: namespace.as_deref(),
-        mode: FieldValidation::Strict,
-        dry: false,
-        owners: None,
-    };
-    let prepared = prepare(context, &new, object)?;
-    let _pass = pass(context, entry.resource, &prepared.object)?;
-    commit(context, &new, prepared.object).await
+    let mode = FieldValidation::Strict;
+    Ok(New { entry, namespace, mode, dry: false, owners: None, with: With::default() })
 }
 
 /// A new object as a POST would store it, without storing it.
@@ -91,16 +96,8 @@ pub(crate) fn prepare_object(
     resource: Resource,
     object: Value,
 ) -> Result<Value, Failure> {
-    let entry = super::registry::of(resource)
-        .ok_or_else(|| Failure::internal(format!("{resource} is not served")))?;
     let namespace = metadata::text(&object, "namespace").map(str::to_owned);
-    let new = New {
-        entry,
-        namespace: namespace.as_deref(),
-        mode: FieldValidation::Strict,
-        dry: false,
-        owners: None,
-    };
+    let new = ours(resource, namespace.as_deref())?;
     prepare(context, &new, object).map(|prepared| prepared.object)
 }
 
@@ -137,6 +134,62 @@ pub(crate) fn pass(
         .map_err(|violations| refused(text("name"), &violations))
 }
 
+/// A new object of a transaction.
+pub(super) fn prepare_with(
+    context: &Context,
+    entry: &'static Entry,
+    namespace: Option<&str>,
+    object: Value,
+    with: With<'_>,
+) -> Result<Value, Failure> {
+    let mode = FieldValidation::Strict;
+    let new = New { entry, namespace, mode, dry: false, owners: None, with };
+    prepare(context, &new, object).map(|prepared| prepared.object)
+}
+
+/// As [`pass`], of a transaction. One that brings its namespace's quota itself is held to that by [`judge`].
+pub(super) fn pass_with(
+    context: &Context,
+    resource: Resource,
+    object: &Value,
+    with: With<'_>,
+) -> Result<Option<Pass>, Failure> {
+    let namespace = metadata::text(object, "namespace").unwrap_or_default();
+    match resource == TASKS && with.brings_quota(namespace) {
+        true => Ok(None),
+        false => pass(context, resource, object),
+    }
+}
+
+/// What of a transaction's new tasks the quotas do not let in that it brings itself: all tasks of a namespace together, in
+/// their order, before anybody else can ask. By their place among `with.objects`.
+pub(super) fn judge(context: &Context, with: With<'_>) -> Vec<(usize, Failure)> {
+    let mut asked: BTreeMap<&str, Vec<(usize, &Value)>> = BTreeMap::new();
+    for (index, object) in with.objects.iter().enumerate().filter(|(_, o)| o["kind"] == "Task") {
+        let namespace = metadata::text(object, "namespace").unwrap_or(DEFAULT);
+        asked.entry(namespace).or_default().push((index, object));
+    }
+    asked.retain(|namespace, _| with.brings_quota(namespace));
+    let mut refusals = Vec::new();
+    for (namespace, tasks) in asked {
+        let Some(quota) = with.quota_of(context, namespace) else { continue };
+        let asking = tasks.into_iter().filter_map(|(index, task)| {
+            let mut full = task.clone();
+            quota::fill_defaults(&quota.defaults, &mut full);
+            // What cannot be read is refused by itself, with its place.
+            Some((index, task, resources_of(&full).ok()?))
+        });
+        let asking: Vec<_> = asking.collect();
+        let wanted = asking.iter().map(|(.., resources)| resources);
+        let judged = context.door.rehearse(&context.store, (namespace, &quota), wanted);
+        for ((index, task, _), judged) in asking.iter().zip(judged) {
+            let name = metadata::text(task, "name").unwrap_or_default();
+            refusals.extend(judged.err().map(|violations| (*index, refused(name, &violations))));
+        }
+    }
+    refusals
+}
+
 /// As [`pass`], for who only asks.
 fn would_pass(context: &Context, resource: Resource, object: &Value) -> Result<(), Failure> {
     let text = |field: &str| metadata::text(object, field).unwrap_or_default();
@@ -165,6 +218,24 @@ pub(super) fn refused(name: &str, violations: &Violations) -> Failure {
     }
 }
 
+/// What is stored in the same transaction.
+#[derive(Clone, Copy, Default)]
+pub(super) struct With<'a> {
+    /// New objects, as they were sent.
+    pub(super) objects: &'a [Value],
+}
+
+impl With<'_> {
+    /// The quota that there is then.
+    fn quota_of(&self, context: &Context, namespace: &str) -> Option<QuotaSpec> {
+        together::quota_of(context, self.objects, namespace)
+    }
+
+    fn brings_quota(&self, namespace: &str) -> bool {
+        objects::among(self.objects, "Quota", (namespace, QUOTA_NAME)).is_some()
+    }
+}
+
 /// What is asked for.
 struct New<'a> {
     entry: &'static Entry,
@@ -173,6 +244,7 @@ struct New<'a> {
     dry: bool,
     /// Whose its fields are, when somebody keeps account.
     owners: Option<Value>,
+    with: With<'a>,
 }
 
 async fn store_new(
@@ -188,19 +260,23 @@ async fn store_new(
         }
         namespace::admit_into(context, new.entry, new.namespace, name)?;
         would_pass(context, new.entry.resource, &prepared.object)?;
-        return Ok((prepared.object.to_string().into(), prepared.warnings));
+        return Ok((admission::render(&prepared.object)?, prepared.warnings));
     }
     let _pass = pass(context, new.entry.resource, &prepared.object)?;
-    let stored = commit(context, new, prepared.object).await?;
-    Ok((stored.bytes.clone(), prepared.warnings))
+    let (stored, warnings) = commit(context, new, prepared).await?;
+    Ok((stored.bytes.clone(), warnings))
+}
+
+/// A new object as it would be stored.
+struct Prepared {
+    object: Value,
+    warnings: Vec<HeaderValue>,
+    /// What its name was made of; none: the client named it.
+    prefix: Option<String>,
 }
 
 /// The object as it would be stored.
-fn prepare(
-    context: &Context,
-    new: &New<'_>,
-    mut object: Value,
-) -> Result<admission::Admitted, Failure> {
+fn prepare(context: &Context, new: &New<'_>, mut object: Value) -> Result<Prepared, Failure> {
     let info = new.entry.info;
     admission::identify(new.entry, &mut object)?;
     if info.has_status
@@ -232,7 +308,7 @@ fn prepare(
         _ => {}
     }
     if new.entry.resource == TASKS
-        && let Some(quota) = new.namespace.and_then(|ns| quota::of(&context.store, ns))
+        && let Some(quota) = new.namespace.and_then(|ns| new.with.quota_of(context, ns))
     {
         quota::fill_defaults(&quota.defaults, &mut object);
     }
@@ -240,16 +316,16 @@ fn prepare(
         return Err(Failure::bad_request("metadata is not a JSON object"));
     };
     metadata::begin(context, own, !info.group.is_empty());
-    if own.get("name").and_then(Value::as_str).is_none_or(str::is_empty)
-        && let Some(prefix) = own.get("generateName").and_then(Value::as_str)
-    {
-        let name = format!("{prefix}{}", suffix());
-        own.insert("name".into(), name.into());
+    let unnamed = own.get("name").and_then(Value::as_str).is_none_or(str::is_empty);
+    let prefix = own.get("generateName").and_then(Value::as_str).filter(|_| unnamed);
+    let prefix = prefix.map(str::to_owned);
+    if let Some(prefix) = &prefix {
+        own.insert("name".into(), format!("{prefix}{}", suffix()).into());
     }
     let name = metadata::text(&object, "name").unwrap_or_default().to_owned();
     let mut admitted = admission::admit(new.entry, &name, object, new.mode)?;
     if new.entry.resource == TASKS {
-        depends::check(&context.store, &admitted.object)
+        depends::check(&context.store, new.with.objects, &admitted.object)
             .map_err(|violations| Failure::invalid(new.entry, &name, &violations))?;
     }
     if let Some(owners) = &new.owners {
@@ -258,16 +334,17 @@ fn prepare(
     if info.kind == "Namespace" {
         namespace::complete(&mut admitted.object);
     }
-    Ok(admitted)
+    let admission::Admitted { object, warnings } = admitted;
+    Ok(Prepared { object, warnings, prefix })
 }
 
 /// Stores it, in a namespace that is there and not ending at the moment of the commit.
 async fn commit(
     context: &Context,
     new: &New<'_>,
-    mut object: Value,
-) -> Result<Arc<Stored>, Failure> {
-    let prefix = metadata::text(&object, "generateName").map(str::to_owned);
+    prepared: Prepared,
+) -> Result<(Arc<Stored>, Vec<HeaderValue>), Failure> {
+    let Prepared { mut object, warnings, prefix } = prepared;
     for _ in 0..ATTEMPTS {
         let name = metadata::text(&object, "name").unwrap_or_default().to_owned();
         let key = new.entry.key(new.namespace, &name);
@@ -280,12 +357,16 @@ async fn commit(
         });
         match context.store.apply(ops).await {
             Ok(mut stored) => {
-                return stored.pop().ok_or_else(|| Failure::internal("nothing was stored"));
+                let stored = stored.pop();
+                let stored = stored.ok_or_else(|| Failure::internal("nothing was stored"))?;
+                return Ok((stored, warnings));
             }
-            Err(StoreError::AlreadyExists { .. }) if prefix.is_some() => {
-                let prefix = prefix.as_deref().unwrap_or_default();
-                object["metadata"]["name"] = format!("{prefix}{}", suffix()).into();
-            }
+            Err(error @ StoreError::AlreadyExists { .. }) => match &prefix {
+                Some(prefix) => {
+                    object["metadata"]["name"] = format!("{prefix}{}", suffix()).into();
+                }
+                None => return Err(Failure::of_store(new.entry, &name, &error)),
+            },
             // The namespace changed in between: look at it again.
             Err(
                 StoreError::Conflict { key: changed, .. } | StoreError::NotFound { key: changed },

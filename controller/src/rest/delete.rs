@@ -8,22 +8,28 @@
 use std::sync::Arc;
 
 use axum::response::Response;
+use futures::{StreamExt as _, stream};
 use http::StatusCode;
 use jiff::Timestamp;
+use muster_api::kind::node::Node;
+use muster_api::kind::node::estop::EStopTier;
 use muster_api::kind::task::DEFAULT_GRACE_SECONDS;
 use muster_api::name::NodeName;
 use muster_api::phase::TaskPhase;
 use muster_controller_core::deletion::{Deletion, deletion};
-use serde::Deserialize;
+use serde::{Deserialize, Deserializer};
 use serde_json::{Value, json};
 
 use super::path::Object;
 use super::registry::Entry;
 use super::selector::Selection;
-use super::{Answer, Call, body, failure::Failure, metadata};
+use super::{Answer, Call, body, failure::Failure, form::Form, list, metadata};
 use crate::context::Context;
 use crate::objects;
-use crate::store::{Key, Op, Precondition, Resource, Store, StoreError, Stored};
+use crate::store::{Key, Op, Resource, StoreError, Stored};
+
+/// Objects of a collection that are ended at once: they share commits, and ten thousand of them take no minute.
+const AT_ONCE: usize = 64;
 
 /// `DeleteOptions`.
 #[derive(Debug, Clone, Default, Deserialize)]
@@ -31,8 +37,17 @@ use crate::store::{Key, Op, Precondition, Resource, Store, StoreError, Stored};
 struct Options {
     grace_period_seconds: Option<i64>,
     propagation_policy: Option<String>,
+    #[serde(deserialize_with = "or_default")]
     preconditions: Preconditions,
+    #[serde(deserialize_with = "or_default")]
     dry_run: Vec<String>,
+}
+
+/// What is null is as good as left out.
+fn or_default<'de, D: Deserializer<'de>, T: Deserialize<'de> + Default>(
+    from: D,
+) -> Result<T, D::Error> {
+    Option::deserialize(from).map(Option::unwrap_or_default)
 }
 
 #[derive(Debug, Clone, Default, Deserialize)]
@@ -55,6 +70,17 @@ pub fn is_held(resource: Resource, object: &Value) -> bool {
     given && !phase.is_ok_and(TaskPhase::is_terminal)
 }
 
+/// Whether the object ends already, and it is for others to do something before it goes: to delete it once more is of no use.
+#[must_use]
+pub fn waits_for_others(stored: &Stored) -> bool {
+    if !stored.mentions("deletionTimestamp") {
+        return false;
+    }
+    let object = stored.value();
+    let waits = metadata::has_finalizers(&object) || is_held(stored.key.resource, &object);
+    metadata::is_ending(&object) && waits
+}
+
 /// Deletes an object in this process, as a client's DELETE does: at once where nobody has to confirm anything.
 /// Returns the last state, or the state with its `deletionTimestamp`.
 ///
@@ -62,6 +88,21 @@ pub fn is_held(resource: Resource, object: &Value) -> bool {
 /// What a client would be told.
 pub async fn delete_object(context: &Context, key: &Key) -> Result<Arc<Stored>, Failure> {
     delete_with_grace(context, key, None).await
+}
+
+/// As [`delete_object`], if the object is still what `seen` shows.
+///
+/// # Errors
+/// What a client would be told: 409 when it has changed.
+pub(crate) async fn delete_as_seen(context: &Context, seen: &Stored) -> Result<(), Failure> {
+    let entry = super::registry::of(seen.key.resource)
+        .ok_or_else(|| Failure::internal(format!("{} is not served", seen.key.resource)))?;
+    let preconditions = Preconditions {
+        uid: Some(seen.uid.to_string()),
+        resource_version: Some(seen.revision.to_string()),
+    };
+    let options = Options { preconditions, ..Options::default() };
+    end(context, entry, &seen.key, &options).await.map(drop)
 }
 
 /// As [`delete_object`], with the grace period that a client would name, seconds.
@@ -81,24 +122,30 @@ pub(crate) async fn delete_with_grace(
     }
 }
 
-/// Ends this object and no other of its name.
+/// What else must hold for an object to be ended, looked at anew before each try: a condition for the transaction, none, or
+/// why it is not ended.
+pub(super) type Guard<'a> = dyn Fn(&Stored) -> Result<Option<Op>, Failure> + Sync + 'a;
+
+/// Ends this object and no other of its name, as long as the guard lets it.
 pub(super) async fn end_this(
     context: &Context,
     stored: &Stored,
     grace_period_seconds: Option<i64>,
+    guard: &Guard<'_>,
 ) -> Result<(), Failure> {
     let entry = super::registry::of(stored.key.resource)
         .ok_or_else(|| Failure::internal(format!("{} is not served", stored.key.resource)))?;
     let uid = Some(stored.uid.to_string());
     let preconditions = Preconditions { uid, ..Preconditions::default() };
     let options = Options { grace_period_seconds, preconditions, ..Options::default() };
-    end(context, entry, &stored.key, &options).await.map(drop)
+    end_guarded(context, entry, &stored.key, &options, guard).await.map(drop)
 }
 
 /// The deletion of an object as a part of a transaction: at once where nobody has to confirm anything, else the wish.
 pub(crate) fn operation(now: Timestamp, present: &Stored) -> Op {
     let (object, key) = (present.value(), present.key.clone());
-    if !metadata::has_finalizers(&object) && !is_held(key.resource, &object) {
+    let waits = metadata::has_finalizers(&object) || is_held(key.resource, &object);
+    if !waits && !super::namespace::is_ours_to_end(key.resource) {
         return Op::remove(key, present.revision);
     }
     Op::replace(key, wish(now, &object, &Options::default(), None), present.revision)
@@ -117,26 +164,26 @@ pub(super) async fn delete(call: Call, target: Object) -> Answer {
 pub(super) async fn collection(call: Call, target: Object) -> Answer {
     let selection = Selection::read(target.entry, target.namespace.as_deref(), &call.query)?;
     let (context, options) = read(call).await?;
-    let mut snapshot = context.store.list(target.entry.resource, target.namespace.as_deref());
-    snapshot.items.retain(|stored| selection.matches(stored));
-    for stored in &snapshot.items {
-        match end(&context, target.entry, &stored.key, &options).await {
-            Ok(_) => {}
-            // Somebody else was faster.
-            Err(failure) if failure.code() == 404 => {}
-            Err(failure) => return Err(failure),
+    let snapshot = context.store.list(target.entry.resource, target.namespace.as_deref());
+    let (items, _) = list::select(&selection, snapshot.items, None).await;
+    let (of, with) = (&*context, &options);
+    let end = |stored: Arc<Stored>| async move {
+        match end(of, target.entry, &stored.key, with).await {
+            // Gone: somebody else was faster.
+            Err(failure) if failure.code() != 404 => Err(failure),
+            _ => Ok(()),
         }
+    };
+    // Every one is tried, and the first refusal is told.
+    let mut ends = stream::iter(items.clone()).map(end).buffer_unordered(AT_ONCE);
+    let mut ended = Ok(());
+    while let Some(one) = ends.next().await {
+        ended = ended.and(one);
     }
-    let items: Vec<Value> =
-        snapshot.items.iter().map(|stored| target.entry.value(stored)).collect();
-    let info = target.entry.info;
-    let list = json!({
-        "kind": format!("{}List", info.kind),
-        "apiVersion": info.api_version(),
-        "metadata": {"resourceVersion": context.store.revision().to_string()},
-        "items": items,
-    });
-    Ok(super::json(StatusCode::OK, &list))
+    drop(ends);
+    ended?;
+    let revision = context.store.revision().to_string();
+    list::answer(&context, (&revision, ""), items, (Form::Whole, target.entry)).await
 }
 
 async fn read(call: Call) -> Result<(Arc<Context>, Options), Failure> {
@@ -182,6 +229,16 @@ async fn end(
     key: &Key,
     options: &Options,
 ) -> Result<Ended, Failure> {
+    end_guarded(context, entry, key, options, &|_| Ok(None)).await
+}
+
+async fn end_guarded(
+    context: &Context,
+    entry: &'static Entry,
+    key: &Key,
+    options: &Options,
+    guard: &Guard<'_>,
+) -> Result<Ended, Failure> {
     let name = &*key.name;
     if entry.info.kind == "Namespace" && name == muster_api::kind::namespace::DEFAULT {
         return Err(Failure::denied(format!(
@@ -204,29 +261,31 @@ async fn end(
         let present = context.store.get(key).ok_or_else(|| Failure::not_found(entry, name))?;
         if entry.info.kind == "Node" {
             refuse_in_use(context, entry, name)?;
+            refuse_stopped(entry, &present)?;
         }
         check(entry, &present, &options.preconditions)?;
+        let relied_on = guard(&present)?;
         let object = present.value();
         let finalizer = finalizer(options);
         let waits = metadata::has_finalizers(&object)
             || is_held(key.resource, &object)
-            || super::namespace::is_ours_to_end(entry)
+            || super::namespace::is_ours_to_end(key.resource)
             || finalizer.is_some();
         let wish = waits.then(|| wish(context.clock.now(), &object, options, finalizer));
         if !options.dry_run.is_empty() {
             return Ok(if waits { Ended::Waiting(present) } else { Ended::Gone(present) });
         }
-        let ended = match wish {
-            None => remove(&context.store, &present).await.map(Ended::Gone),
+        let (op, ended): (Op, fn(Arc<Stored>) -> Ended) = match wish {
+            None => (Op::remove(key.clone(), present.revision), Ended::Gone),
             // It already ends, and no sooner for this.
             Some(wish) if wish == object => return Ok(Ended::Waiting(present)),
-            Some(wish) => {
-                let precondition = Precondition::revision(present.revision);
-                context.store.put(key.clone(), wish, precondition).await.map(Ended::Waiting)
-            }
+            Some(wish) => (Op::replace(key.clone(), wish, present.revision), Ended::Waiting),
         };
-        match ended {
-            Ok(ended) => {
+        let ops: Vec<Op> = relied_on.into_iter().chain([op]).collect();
+        match context.store.apply(ops).await {
+            Ok(mut stored) => {
+                // A condition changes nothing, so there is one change.
+                let ended = ended(stored.pop().unwrap_or(present));
                 // Its agent's session ends at once, and its certificate admits it no more.
                 if let (Some(live), Ok(name)) = (live, NodeName::new(name)) {
                     live.sessions.kick(&name);
@@ -234,6 +293,9 @@ async fn end(
                 return Ok(ended);
             }
             Err(StoreError::Conflict { .. }) => {}
+            // What was relied on came or went meanwhile.
+            Err(StoreError::AlreadyExists { key: other } | StoreError::NotFound { key: other })
+                if other != *key => {}
             Err(error) => return Err(Failure::of_store(entry, name, &error)),
         }
     }
@@ -259,8 +321,17 @@ fn refuse_in_use(context: &Context, entry: &Entry, node: &str) -> Result<(), Fai
     Err(Failure::new(StatusCode::CONFLICT, "NodeInUse", why).about(entry, node))
 }
 
-async fn remove(store: &Store, present: &Stored) -> Result<Arc<Stored>, StoreError> {
-    store.delete(present.key.clone(), Precondition::revision(present.revision)).await
+/// 409 while a person has stopped the robot: without the object nobody demands that any more, and it would move.
+fn refuse_stopped(entry: &Entry, present: &Stored) -> Result<(), Failure> {
+    let tier = objects::read::<Node>(present).map_or(EStopTier::None, |node| node.spec.estop);
+    if tier.is_none() {
+        return Ok(());
+    }
+    let name = &*present.key.name;
+    let why = format!(
+        "node {name} is stopped ({tier}), and would move again without its object; release it first (`muster estop {name} --release`)"
+    );
+    Err(Failure::new(StatusCode::CONFLICT, "NodeStopped", why).about(entry, name))
 }
 
 /// Who has to act before the object goes, because of how it is deleted.

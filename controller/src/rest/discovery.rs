@@ -253,7 +253,11 @@ fn resource(entry: &Entry) -> Vec<Shown> {
         sub("log", None, info.kind, &["get"]);
     }
     match (info.group, info.kind) {
-        ("", "Pod") => sub("eviction", Some(("policy", "v1")), "Eviction", &["create"]),
+        ("", "Pod") => {
+            sub("attach", None, "PodAttachOptions", &["create", "get"]);
+            sub("eviction", Some(("policy", "v1")), "Eviction", &["create"]);
+            sub("exec", None, "PodExecOptions", &["create", "get"]);
+        }
         (GROUP, "Node") => sub("fence", None, "NodeFence", &["create"]),
         (_, "TaskSet") => {
             sub("scale", Some(("autoscaling", "v1")), "Scale", &["get", "patch", "update"]);

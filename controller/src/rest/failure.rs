@@ -16,11 +16,13 @@ pub struct Failure {
     reason: &'static str,
     message: String,
     details: Value,
+    /// Where a list may go on all the same.
+    resume: Option<String>,
 }
 
 impl Failure {
     pub(crate) fn new(code: StatusCode, reason: &'static str, message: impl Into<String>) -> Self {
-        Self { code, reason, message: message.into(), details: Value::Null }
+        Self { code, reason, message: message.into(), details: Value::Null, resume: None }
     }
 
     /// The HTTP status.
@@ -83,6 +85,11 @@ impl Failure {
         Self::new(StatusCode::GATEWAY_TIMEOUT, "Timeout", message)
     }
 
+    /// What came is more than is taken.
+    pub(crate) fn too_large(message: impl Into<String>) -> Self {
+        Self::new(StatusCode::PAYLOAD_TOO_LARGE, "RequestEntityTooLarge", message)
+    }
+
     /// More is asked at once than is worked on.
     pub(crate) fn too_many() -> Self {
         let message = "too many requests at once; try again";
@@ -127,6 +134,11 @@ impl Failure {
         Self::new(StatusCode::GONE, "Expired", why.to_string())
     }
 
+    /// Says with which `continue` the rest of a list can still be had.
+    pub(crate) fn resumed_by(self, token: String) -> Self {
+        Self { resume: Some(token), ..self }
+    }
+
     /// What Kubernetes says to a revision that it has not reached.
     pub(crate) fn ahead(asked: u64, current: u64) -> Self {
         let message = format!("Too large resource version: {asked}, current: {current}");
@@ -151,7 +163,11 @@ impl Failure {
 
     /// The same for a body that is no object.
     pub(crate) fn invalid_body(what: &str, violations: &Violations) -> Self {
-        let texts: Vec<String> = violations.iter().map(ToString::to_string).collect();
+        let mut texts: Vec<String> =
+            violations.iter().map(|violation| short(violation.to_string())).collect();
+        if violations.is_full() {
+            texts.push("and more".to_owned());
+        }
         let texts = match &texts[..] {
             [only] => only.clone(),
             several => format!("[{}]", several.join(", ")),
@@ -162,8 +178,8 @@ impl Failure {
             .map(|violation| {
                 json!({
                     "reason": violation.kind.cause_reason(),
-                    "message": violation.message(),
-                    "field": violation.path,
+                    "message": short(violation.message()),
+                    "field": short(violation.path.clone()),
                 })
             })
             .collect();
@@ -210,7 +226,7 @@ impl Failure {
         match error {
             StoreError::AlreadyExists { .. } => Self::already_exists(entry, name),
             StoreError::NotFound { .. } => Self::not_found(entry, name),
-            StoreError::Conflict { .. } => Self::stale(entry, name),
+            StoreError::Conflict { .. } | StoreError::Moved { .. } => Self::stale(entry, name),
             StoreError::UidMismatch { expected, actual, .. } => Self::conflict(
                 entry,
                 name,
@@ -236,11 +252,26 @@ impl Failure {
             "reason": self.reason,
             "code": self.code.as_u16(),
         });
+        if let Some(token) = &self.resume {
+            status["metadata"]["continue"] = token.as_str().into();
+        }
         if !self.details.is_null() {
             status["details"] = self.details.clone();
         }
         status
     }
+}
+
+/// Longest text about one field, bytes: what it quotes may be megabytes.
+const LONGEST: usize = 1024;
+
+/// A text of a length that people read.
+fn short(mut text: String) -> String {
+    if text.len() > LONGEST {
+        text.truncate(text.floor_char_boundary(LONGEST));
+        text.push('…');
+    }
+    text
 }
 
 impl IntoResponse for Failure {

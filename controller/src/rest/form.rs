@@ -13,18 +13,21 @@ use super::registry::Entry;
 use crate::store::Stored;
 
 /// The form of an answer.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub(super) enum Form {
     /// As they are.
     Whole,
-    /// `PartialObjectMetadata`.
-    Metadata,
-    /// A `Table`, with as much of each object beside its row.
-    Table(Include),
+    /// `PartialObjectMetadata` of this version of `meta.k8s.io`.
+    Metadata(&'static str),
+    /// A `Table` of this version of `meta.k8s.io`, with as much of each object beside its row.
+    Table(Include, &'static str),
 }
 
+/// The versions of `meta.k8s.io`, which have the same forms; older tools ask for the second.
+const META: [&str; 2] = ["meta.k8s.io/v1", "meta.k8s.io/v1beta1"];
+
 /// `includeObject` of a table.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub(super) enum Include {
     None,
     Metadata,
@@ -44,19 +47,21 @@ impl Form {
             let parameters: Vec<(&str, &str)> =
                 parts.filter_map(|part| part.split_once('=')).collect();
             let of = |name: &str| parameters.iter().find(|(n, _)| *n == name).map(|(_, v)| *v);
-            match (media, of("as"), of("g"), of("v")) {
-                ("application/json" | "application/*" | "*/*", None, _, _) => {
+            let version =
+                format!("{}/{}", of("g").unwrap_or_default(), of("v").unwrap_or_default());
+            let version = META.into_iter().find(|known| *known == version);
+            match (media, of("as"), version) {
+                ("application/json" | "application/*" | "*/*", None, _) => {
                     return Ok(Self::Whole);
                 }
-                ("application/json", Some("Table"), Some("meta.k8s.io"), Some("v1")) => {
-                    return Ok(Self::Table(Include::read(query)?));
+                ("application/json", Some("Table"), Some(version)) => {
+                    return Ok(Self::Table(Include::read(query)?, version));
                 }
                 (
                     "application/json",
                     Some("PartialObjectMetadata" | "PartialObjectMetadataList"),
-                    Some("meta.k8s.io"),
-                    Some("v1"),
-                ) => return Ok(Self::Metadata),
+                    Some(version),
+                ) => return Ok(Self::Metadata(version)),
                 _ => {}
             }
         }
@@ -76,11 +81,12 @@ impl Form {
     pub(super) fn object(self, entry: &Entry, stored: &Stored) -> Bytes {
         match self {
             Self::Whole => entry.render(stored),
-            Self::Metadata => self.item(entry, stored),
-            Self::Table(_) => {
+            Self::Metadata(_) => self.item(entry, stored),
+            Self::Table(..) => {
                 let mut table = self.head(entry, &stored.revision.to_string(), "").into_bytes();
                 table.extend_from_slice(&self.item(entry, stored));
-                table.extend_from_slice(self.tail().as_bytes());
+                // In a watch it stands in a line of its own.
+                table.extend_from_slice(self.tail().trim_end().as_bytes());
                 table.into()
             }
         }
@@ -95,11 +101,11 @@ impl Form {
                 entry.info.kind,
                 entry.info.api_version()
             ),
-            Self::Metadata => format!(
-                "{{\"kind\":\"PartialObjectMetadataList\",\"apiVersion\":\"meta.k8s.io/v1\",\"metadata\":{metadata},\"items\":["
+            Self::Metadata(version) => format!(
+                "{{\"kind\":\"PartialObjectMetadataList\",\"apiVersion\":\"{version}\",\"metadata\":{metadata},\"items\":["
             ),
-            Self::Table(_) => format!(
-                "{{\"kind\":\"Table\",\"apiVersion\":\"meta.k8s.io/v1\",\"metadata\":{metadata},\"columnDefinitions\":{},\"rows\":[",
+            Self::Table(_, version) => format!(
+                "{{\"kind\":\"Table\",\"apiVersion\":\"{version}\",\"metadata\":{metadata},\"columnDefinitions\":{},\"rows\":[",
                 definitions(entry)
             ),
         }
@@ -109,8 +115,39 @@ impl Form {
     pub(super) fn item(self, entry: &Entry, stored: &Stored) -> Bytes {
         match self {
             Self::Whole => entry.render(stored),
-            Self::Metadata => partial(&entry.value(stored)).to_string().into(),
-            Self::Table(include) => row(entry, &entry.value(stored), include).to_string().into(),
+            Self::Metadata(version) => partial(&entry.value(stored), version).to_string().into(),
+            Self::Table(include, version) => {
+                row(entry, &entry.value(stored), (include, version)).to_string().into()
+            }
+        }
+    }
+
+    /// The object of a bookmark: how far a watch has come, and, when it is `initial`, that everything was told that there was.
+    pub(super) fn bookmark(self, entry: &Entry, revision: u64, initial: bool) -> Value {
+        let mut metadata =
+            json!({"resourceVersion": revision.to_string(), "creationTimestamp": null});
+        if initial {
+            metadata["annotations"] = json!({"k8s.io/initial-events-end": "true"});
+        }
+        let info = entry.info;
+        match self {
+            Self::Whole => {
+                json!({"kind": info.kind, "apiVersion": info.api_version(), "metadata": metadata})
+            }
+            // Who asked for metadata reads nothing else.
+            Self::Metadata(version) => {
+                json!({"kind": "PartialObjectMetadata", "apiVersion": version, "metadata": metadata})
+            }
+            // A table has no annotations; its row's object has.
+            Self::Table(_, version) => {
+                let object = json!({"kind": "PartialObjectMetadata", "apiVersion": version, "metadata": metadata});
+                let rows =
+                    if initial { json!([{"cells": [], "object": object}]) } else { json!([]) };
+                json!({
+                    "kind": "Table", "apiVersion": version, "columnDefinitions": [], "rows": rows,
+                    "metadata": {"resourceVersion": revision.to_string()},
+                })
+            }
         }
     }
 
@@ -133,9 +170,9 @@ impl Include {
     }
 }
 
-fn partial(object: &Value) -> Value {
+fn partial(object: &Value, version: &str) -> Value {
     json!({
-        "kind": "PartialObjectMetadata", "apiVersion": "meta.k8s.io/v1",
+        "kind": "PartialObjectMetadata", "apiVersion": version,
         "metadata": object["metadata"],
     })
 }
@@ -154,14 +191,14 @@ fn definitions(entry: &Entry) -> Value {
     is_named(entry.info).then_some(name).into_iter().chain(columns).collect()
 }
 
-fn row(entry: &Entry, object: &Value, include: Include) -> Value {
+fn row(entry: &Entry, object: &Value, (include, version): (Include, &str)) -> Value {
     let name = is_named(entry.info).then(|| object["metadata"]["name"].clone());
     let cells = columns(entry.info).cells(object, Timestamp::now());
     let cells = cells.iter().map(|cell| Value::from(cell.text()));
     let cells: Vec<Value> = name.into_iter().chain(cells).collect();
     match include {
         Include::None => json!({ "cells": cells }),
-        Include::Metadata => json!({ "cells": cells, "object": partial(object) }),
+        Include::Metadata => json!({ "cells": cells, "object": partial(object, version) }),
         Include::Object => json!({ "cells": cells, "object": object }),
     }
 }
@@ -179,12 +216,14 @@ mod tests {
     #[test]
     fn the_first_form_that_is_served_is_sent() {
         let kubectl = "application/json;as=Table;v=v1;g=meta.k8s.io,application/json;as=Table;v=v1beta1;g=meta.k8s.io,application/json";
-        assert_eq!(read(kubectl), Ok(Form::Table(Include::Metadata)));
+        assert_eq!(read(kubectl), Ok(Form::Table(Include::Metadata, META[0])));
+        let older = "application/json;as=Table;v=v1beta1;g=meta.k8s.io, application/json";
+        assert_eq!(read(older), Ok(Form::Table(Include::Metadata, META[1])));
         assert_eq!(
             read(
                 "application/vnd.kubernetes.protobuf;as=PartialObjectMetadataList;g=meta.k8s.io;v=v1,application/json;as=PartialObjectMetadataList;g=meta.k8s.io;v=v1,application/json"
             ),
-            Ok(Form::Metadata)
+            Ok(Form::Metadata(META[0]))
         );
         assert_eq!(read("application/vnd.kubernetes.protobuf,application/json"), Ok(Form::Whole));
         assert_eq!(read("text/html, */*;q=0.1"), Ok(Form::Whole));

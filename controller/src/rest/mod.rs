@@ -8,6 +8,8 @@
 //! | `query`, `body`, `protobuf` | parameters; bodies with their limit |
 //! | `registry` | what is served: one entry a kind |
 //! | `discovery`, `openapi` | /api, /apis, resource lists, /version; schemas of everything |
+//! | `rendered` | changes as many watchers see them, rendered once |
+//! | `stream` | answers that last, and their places |
 //! | `form` | whole objects, their metadata, or tables |
 //! | [`create`], `list`, `watch`, `update`, `patch`, [`delete`] | verbs on objects |
 //! | `owners`, `strategic` | server-side apply and field owners; kubectl's merge of core kinds |
@@ -16,24 +18,28 @@
 //! | [`namespace`] | the default namespace; ending of namespaces |
 //! | [`token`], `join`, `enrol` | join tokens; certificates for agents; which agent speaks for a node |
 //! | `scale` | how many tasks a set has, as `autoscaling/v1` Scale |
-//! | `core_node`, `eviction`, `metrics_api` | what is written through core kinds; `kubectl drain`, `kubectl top` |
+//! | `core_view`, `eviction`, `metrics_api` | what is written through core kinds; `kubectl drain`, `kubectl top` |
 //! | `review` | what a client may do, and who it is |
 //! | `fence` | a person's word that a node is off |
 //! | `offers` | what frameworks are offered, and why they are not |
 //! | `poses` | where robots are now |
 //! | `together` | what objects have wrong only all together |
+//! | `transaction` | several objects in one commit, while what was planned still holds |
+//! | `sets` | what TaskSets among planned objects would do |
 //! | `question` | plan, why, usage: answers that are no objects |
+//! | `exec` | programs that clients run in tasks |
 //! | [`log`] | logs of tasks |
 //! | [`failure`] | every refusal as a `metav1.Status` |
 
 mod admission;
 mod body;
-mod core_node;
+mod core_view;
 pub mod create;
 pub mod delete;
 mod discovery;
 pub(crate) mod enrol;
 mod eviction;
+mod exec;
 pub mod failure;
 mod fence;
 mod form;
@@ -53,12 +59,16 @@ mod protobuf;
 mod query;
 mod question;
 pub(crate) mod registry;
+mod rendered;
 mod review;
 mod scale;
 mod selector;
+mod sets;
 mod strategic;
+mod stream;
 mod together;
 pub mod token;
+mod transaction;
 mod update;
 mod watch;
 
@@ -71,10 +81,11 @@ use axum::extract::State;
 use axum::response::{IntoResponse as _, Response};
 use http::{HeaderValue, Method, Request, StatusCode, header};
 use serde_json::Value;
-use tokio::sync::Semaphore;
 
 use crate::auth::{Identity, Permission, permits};
 use crate::context::Context;
+pub use body::Bodies;
+use body::Room;
 use failure::Failure;
 use path::{Object, Subresource, Target, Verb};
 use query::Query;
@@ -82,10 +93,12 @@ use registry::View;
 
 /// An answer that takes longer than this is a fault of ours, and the client should hear of it.
 const TIMEOUT: Duration = Duration::from_secs(60);
-/// Requests that are worked on at once, without those that last (watches, logs). A client that finds them all taken is
-/// told to come back: a queue would only make everybody late. One core answers thousands in a second.
-const AT_ONCE: usize = 512;
-static PLACES: Semaphore = Semaphore::const_new(AT_ONCE);
+/// A body that takes longer is of a client that is gone. It takes up no place meanwhile: a few hundred clients that are slow,
+/// or mean to be, would keep out everybody.
+const BODY: Duration = Duration::from_secs(30);
+
+pub use rendered::Rendered;
+pub use stream::Streams;
 
 /// Bytes, ready to be an answer.
 pub(crate) type Answer = Result<Response, Failure>;
@@ -116,16 +129,7 @@ async fn handle(State(context): State<Arc<Context>>, request: Request<Body>) -> 
     );
     let answer = match read {
         Err(failure) => Err(failure),
-        Ok((verb, target)) if long => dispatch(context, verb, target, request).await,
-        Ok((verb, target)) => {
-            // Whether it lives is asked when it is busy, above all.
-            let place = PLACES.try_acquire();
-            if place.is_err() && !matches!(target, Target::Health(_)) {
-                Err(Failure::too_many())
-            } else {
-                within(TIMEOUT, dispatch(context, verb, target, request)).await
-            }
-        }
+        Ok((verb, target)) => answer(context, (verb, target, long), request).await,
     };
     let response = answer.unwrap_or_else(Failure::into_response);
     let code = response.status().as_u16().to_string();
@@ -139,40 +143,67 @@ async fn handle(State(context): State<Arc<Context>>, request: Request<Body>) -> 
     response
 }
 
-/// The answer, or that there was none in time.
-async fn within(limit: Duration, answer: impl Future<Output = Answer>) -> Answer {
-    match tokio::time::timeout(limit, answer).await {
-        Ok(answer) => answer,
-        Err(_) => Err(Failure::timeout("the request was not answered in time")),
+/// Takes the request whole, finds it a place, and answers it in time. One that lasts needs no place and has no deadline.
+async fn answer(
+    context: Arc<Context>,
+    (verb, target, long): (Verb, Target, bool),
+    request: Request<Body>,
+) -> Answer {
+    let late = "the request did not come in time";
+    // The room of its body is taken until it is answered.
+    let received = receive(&context.bodies, (verb, &target), request);
+    let (identity, request, _room) = within(BODY, late, received).await?;
+    let query = Query::read(request.uri())?;
+    let call = Call { context: Arc::clone(&context), identity, query, request };
+    if long {
+        return dispatch(call, verb, target).await;
+    }
+    // Whether it lives is asked when it is busy, above all.
+    let place = context.places.try_acquire();
+    if place.is_err() && !matches!(target, Target::Health(_)) {
+        return Err(Failure::too_many());
+    }
+    let late = "the request was not answered in time";
+    within(TIMEOUT, late, dispatch(call, verb, target)).await
+}
+
+/// What comes of it, or that it was late.
+async fn within<T>(
+    limit: Duration,
+    late: &str,
+    work: impl Future<Output = Result<T, Failure>>,
+) -> Result<T, Failure> {
+    match tokio::time::timeout(limit, work).await {
+        Ok(done) => done,
+        Err(_) => Err(Failure::timeout(late)),
     }
 }
 
-async fn dispatch(
-    context: Arc<Context>,
-    verb: Verb,
-    target: Target,
+/// Who sends it, if they may, and the request with its body.
+async fn receive(
+    bodies: &Bodies,
+    (verb, target): (Verb, &Target),
     request: Request<Body>,
-) -> Answer {
+) -> Result<(Identity, Request<Body>, Option<Room>), Failure> {
     let identity = request.extensions().get::<Identity>().cloned().unwrap_or(Identity::Anonymous);
-    match permits(&identity, verb, &target) {
+    match permits(&identity, verb, target) {
         Permission::Granted => {}
         Permission::WhoAreYou => {
             return Err(Failure::unauthorized("a client certificate is needed"));
         }
-        Permission::Denied => return Err(Failure::forbidden(&identity.name(), verb, &target)),
+        Permission::Denied => return Err(Failure::forbidden(&identity.name(), verb, target)),
     }
-    let request = match *request.method() {
-        Method::GET | Method::HEAD => request,
-        _ => {
-            // Whole, before anything of it is refused: who still writes when the answer comes does not read it, and
-            // sees a broken connection instead.
-            let (parts, body) = request.into_parts();
-            let bytes = body::bytes(body).await?;
-            Request::from_parts(parts, Body::from(bytes))
-        }
-    };
-    let query = Query::read(request.uri())?;
-    let call = Call { context, identity, query, request };
+    if matches!(*request.method(), Method::GET | Method::HEAD) {
+        return Ok((identity, request, None));
+    }
+    // Whole, before anything of it is refused: who still writes when the answer comes does not read it, and sees a broken
+    // connection instead.
+    let (parts, body) = request.into_parts();
+    let (bytes, room) = bodies.of(&identity).gather(body, body::limit(target)).await?;
+    Ok((identity, Request::from_parts(parts, Body::from(bytes)), room))
+}
+
+async fn dispatch(call: Call, verb: Verb, target: Target) -> Answer {
     match target {
         Target::Health(probe) => health(&call.context, probe),
         Target::Metrics => Ok(call.context.metrics.render().into_response()),
@@ -184,6 +215,7 @@ async fn dispatch(
         Target::Join => join::join(call).await,
         Target::Plan => question::plan(call).await,
         Target::Check => together::check(call).await,
+        Target::Transaction => transaction::transaction(call).await,
         Target::Usage => question::usage(&call),
         Target::Offers => offers::list(call.context).await,
         Target::Poses if verb == Verb::Watch => poses::watch(&call),
@@ -194,14 +226,14 @@ async fn dispatch(
 }
 
 async fn objects(call: Call, verb: Verb, object: Object) -> Answer {
+    if !object.allows(verb) {
+        return Err(Failure::method_not_allowed(verb, &object));
+    }
     if object.subresource == Some(Subresource::Log) {
         return log::open(call, object).await;
     }
     if object.subresource == Some(Subresource::Why) {
         return question::why(call, object).await;
-    }
-    if !object.allows(verb) {
-        return Err(Failure::method_not_allowed(verb, &object));
     }
     if object.subresource == Some(Subresource::Pose) {
         return poses::of_node(&call, &object);
@@ -212,15 +244,18 @@ async fn objects(call: Call, verb: Verb, object: Object) -> Answer {
     if object.subresource == Some(Subresource::Scale) {
         return scale::answer(call, verb, object).await;
     }
+    if matches!(object.subresource, Some(Subresource::Exec | Subresource::Attach)) {
+        return exec::open(call, object).await;
+    }
     if object.subresource == Some(Subresource::Eviction) {
         return eviction::evict(call, object).await;
     }
-    if object.entry.view == View::Node && matches!(verb, Verb::Update | Verb::Patch) {
-        return core_node::write(call, verb, object).await;
+    if object.entry.view != View::Stored && matches!(verb, Verb::Update | Verb::Patch) {
+        return core_view::write(call, verb, object).await;
     }
     match verb {
         Verb::Get => list::get(&call, &object),
-        Verb::List => list::list(&call, &object),
+        Verb::List => list::list(call, object).await,
         Verb::Watch => watch::watch(&call, &object),
         Verb::Create => create::create(call, object).await,
         Verb::Update => update::replace(call, object).await,
@@ -249,4 +284,61 @@ pub(crate) fn raw(code: StatusCode, body: impl Into<Body>) -> Response {
     let json = HeaderValue::from_static("application/json");
     response.headers_mut().insert(header::CONTENT_TYPE, json);
     response
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[tokio::test(start_paused = true)]
+    async fn what_is_not_answered_in_time_is_a_timeout() {
+        let never = std::future::pending::<Answer>();
+        let failure = within(TIMEOUT, "too late", never).await.unwrap_err();
+        assert_eq!((failure.code(), failure.message()), (504, "too late"));
+        let soon = async {
+            tokio::time::sleep(TIMEOUT / 2).await;
+            Ok(7)
+        };
+        assert_eq!(within(TIMEOUT, "too late", soon).await.unwrap(), 7);
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn a_body_that_does_not_come_is_not_waited_for() {
+        let never =
+            Body::from_stream(futures::stream::pending::<Result<bytes::Bytes, std::io::Error>>());
+        let request = Request::post("/apis/muster.dev/v1alpha1/join").body(never).unwrap();
+        let (verb, target) = path::read(request.method(), request.uri()).unwrap();
+        let bodies = Bodies::default();
+        let late = within(BODY, "too late", receive(&bodies, (verb, &target), request)).await;
+        assert_eq!(late.unwrap_err().code(), 504);
+    }
+
+    #[tokio::test]
+    async fn strangers_send_little_and_take_no_room_of_others() {
+        let bodies = Bodies::default();
+        let send = async |identity: Identity, path: &str, size: usize| {
+            let mut request = Request::post(path).body(Body::from(vec![b' '; size])).unwrap();
+            request.extensions_mut().insert(identity);
+            let (verb, target) = path::read(request.method(), request.uri()).unwrap();
+            let received = receive(&bodies, (verb, &target), request).await;
+            received.map(|(_, request, room)| (request, room)).map_err(|failure| failure.code())
+        };
+        let (join, plan) = ("/apis/muster.dev/v1alpha1/join", "/apis/muster.dev/v1alpha1/plan");
+        let admin = || Identity::Admin { name: "a".into() };
+        assert_eq!(send(Identity::Anonymous, join, 65 << 10).await.err(), Some(413));
+        assert_eq!(send(admin(), join, 65 << 10).await.err(), Some(413));
+        let mut held = Vec::new();
+        let full = loop {
+            match send(Identity::Anonymous, join, 60 << 10).await {
+                Ok(one) => held.push(one),
+                Err(code) => break code,
+            }
+        };
+        assert_eq!(full, 429, "after {} of them", held.len());
+        assert!(held.len() >= 16);
+        let large = send(admin(), plan, 3 << 20).await;
+        assert!(large.is_ok(), "those who are known have room of their own");
+        held.clear();
+        assert!(send(Identity::Anonymous, join, 60 << 10).await.is_ok());
+    }
 }

@@ -18,9 +18,15 @@ use crate::store::{Key, Op, Precondition, Resource, StoreError, WatchEnd};
 const NAMESPACES: Resource = Resource::new("namespaces");
 /// After a failure of the store; its next commit may pass.
 const RETRY: Duration = Duration::from_secs(1);
+/// While a namespace ends, any write may be what it waits for, and everything in it is looked at again: not for each write of
+/// a busy cluster.
+const PAUSE: Duration = Duration::from_millis(200);
 
 /// Creates the namespace of those who name none.
-pub(crate) async fn bootstrap(context: &Context) -> Result<(), StoreError> {
+///
+/// # Errors
+/// When the store fails.
+pub async fn bootstrap(context: &Context) -> Result<(), StoreError> {
     let mut object = json!({
         "apiVersion": "v1",
         "kind": "Namespace",
@@ -52,8 +58,8 @@ pub(super) fn terminate(object: &mut Value) {
 }
 
 /// Whether the end of this object is [`finalize`]'s to bring about.
-pub(super) fn is_ours_to_end(entry: &Entry) -> bool {
-    entry.resource == NAMESPACES
+pub(super) fn is_ours_to_end(resource: Resource) -> bool {
+    resource == NAMESPACES
 }
 
 /// The condition under which an object may be created in `namespace`; none for cluster-scoped kinds.
@@ -109,6 +115,9 @@ pub(crate) async fn finalize(context: Arc<Context>) {
                 tokio::time::sleep(RETRY).await;
                 return true;
             }
+            if waiting {
+                tokio::time::sleep(PAUSE).await;
+            }
             changed(&context, seen, waiting).await
         };
         // Both arms are cancel safe: the next round looks at everything again.
@@ -138,6 +147,9 @@ async fn empty(context: &Context, key: &Key) -> Result<(), Failure> {
     {
         for stored in context.store.list(entry.resource, Some(&key.name)).items {
             left = true;
+            if delete::waits_for_others(&stored) {
+                continue;
+            }
             match delete::delete_object(context, &stored.key).await {
                 Ok(_) => {}
                 Err(failure) if failure.code() == 404 => {}

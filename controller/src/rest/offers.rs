@@ -10,12 +10,12 @@ use super::Answer;
 use super::failure::Failure;
 use super::path::Object;
 use crate::context::Context;
-use crate::reconcile::desk::Request;
+use crate::reconcile::desk::{Depth, Request};
 
 /// GET …/offers: every framework at the desk with its share and its offers.
 pub(super) async fn list(context: Arc<Context>) -> Answer {
     let live = super::question::live(&context)?;
-    let frameworks = live.frameworks.look().await;
+    let frameworks = live.frameworks.look(Depth::Offers).await;
     Ok(super::json(StatusCode::OK, &json!({ "frameworks": frameworks })))
 }
 
@@ -30,7 +30,7 @@ pub(super) async fn why(context: Arc<Context>, target: &Object) -> Answer {
     let request = Request::Why { uid: (*stored.uid).into(), answer };
     live.scheduler.desk(request).await.map_err(|_| ended())?;
     let why = answered.await.map_err(|_| ended())?;
-    let frameworks = live.frameworks.look().await;
+    let frameworks = live.frameworks.look(Depth::Offers).await;
     let view = frameworks.into_iter().find(|v| *v.uid == *stored.uid);
     // None: it has been away since before the controller began.
     let answer = json!({ "why": why.unwrap_or_default(), "framework": view });

@@ -2,7 +2,8 @@
 //!
 //! It is kept from the first server-side apply of an object on: what was there before belongs to `before-first-apply`, or
 //! to `kubectl-client-side-apply` where the object says that kubectl made it. Objects that nobody applies on the server
-//! carry no such list, which is as long as themselves.
+//! carry no such list, which is as long as themselves. Who writes through a view of a kind (a core Node) is another manager
+//! than who writes the kind: its `apiVersion` tells them apart.
 
 use muster_controller_core::apply::{self, Conflict, Manager, Operation, Owned, Owners, path};
 use serde_json::{Map, Value, json};
@@ -33,13 +34,20 @@ pub(super) struct Writer {
     /// `fieldManager`, or the first word of the user agent.
     pub(super) name: String,
     pub(super) subresource: &'static str,
+    /// The version of the view that is written through, if any.
+    pub(super) view: Option<String>,
     /// Now, RFC 3339.
     pub(super) time: String,
 }
 
 impl Writer {
-    fn manager(&self, operation: Operation) -> Manager {
-        Manager { name: self.name.clone(), operation, subresource: self.subresource.to_owned() }
+    fn manager(&self, entry: &Entry, operation: Operation) -> Manager {
+        Manager {
+            name: self.name.clone(),
+            operation,
+            subresource: self.subresource.to_owned(),
+            version: self.view.clone().unwrap_or_else(|| entry.info.api_version()),
+        }
     }
 }
 
@@ -73,8 +81,12 @@ pub(super) fn of(object: &Value) -> Option<Owners> {
             "Update" => Operation::Update,
             _ => return None,
         };
-        let manager =
-            Manager { name: text("manager"), operation, subresource: text("subresource") };
+        let manager = Manager {
+            name: text("manager"),
+            operation,
+            subresource: text("subresource"),
+            version: text("apiVersion"),
+        };
         Some((manager, Owned { fields: path::read(&entry["fieldsV1"]), time: text("time") }))
     };
     let owners: Owners = entries.iter().filter_map(read).collect();
@@ -82,7 +94,7 @@ pub(super) fn of(object: &Value) -> Option<Owners> {
 }
 
 /// The owners as an object names them.
-pub(super) fn write(entry: &Entry, owners: &Owners) -> Value {
+pub(super) fn write(owners: &Owners) -> Value {
     let one = |(manager, owned): (&Manager, &Owned)| {
         let mut written = json!({
             "manager": manager.name,
@@ -90,7 +102,7 @@ pub(super) fn write(entry: &Entry, owners: &Owners) -> Value {
                 Operation::Apply => "Apply",
                 Operation::Update => "Update",
             },
-            "apiVersion": entry.info.api_version(),
+            "apiVersion": manager.version,
             "time": owned.time,
             "fieldsType": "FieldsV1",
             "fieldsV1": path::write(&owned.fields),
@@ -116,10 +128,10 @@ pub(super) fn after_update(
         Some(said) if said != known => of(&json!({"metadata": {"managedFields": said}}))?,
         _ => of(old)?,
     };
-    let manager = writer.manager(Operation::Update);
+    let manager = writer.manager(entry, Operation::Update);
     let by = (&manager, &*writer.time);
     let after = apply::update(&entry.info.fields(), &ownable(old), &ownable(new), &owners, by);
-    (!after.is_empty()).then(|| write(entry, &after))
+    (!after.is_empty()).then(|| write(&after))
 }
 
 /// What an object becomes when `config` is applied to it; `live` is null when there is none yet. The answer names its
@@ -136,7 +148,7 @@ pub(super) fn applied(
     let owners = match of(live) {
         Some(owners) => owners,
         None if live.is_null() => Owners::new(),
-        None => first(&schema, live, &owned),
+        None => first(entry, live, &owned),
     };
     let mut own = ownable(config);
     if let Some(fields) = own.as_object_mut() {
@@ -146,7 +158,7 @@ pub(super) fn applied(
             subresource => fields.retain(|field, _| field == subresource),
         }
     }
-    let manager = writer.manager(Operation::Apply);
+    let manager = writer.manager(entry, Operation::Apply);
     let application =
         |force| apply::Application { manager: &manager, config: &own, force, time: &writer.time };
     let result = match apply::apply(&schema, &owned, &owners, application(force)) {
@@ -176,12 +188,13 @@ pub(super) fn applied(
             None => {}
         }
     }
-    object["metadata"]["managedFields"] = write(entry, &owners);
+    object["metadata"]["managedFields"] = write(&owners);
     Ok(object)
 }
 
 /// Who owns an object of which nobody has kept account: kubectl what it says that it applied, else somebody all of it.
-fn first(schema: &Value, live: &Value, owned: &Value) -> Owners {
+fn first(entry: &Entry, live: &Value, owned: &Value) -> Owners {
+    let schema = &entry.info.fields();
     let (name, fields) = match last_applied(live) {
         Some(last) => {
             let there = apply::all_of(schema, owned);
@@ -196,8 +209,12 @@ fn first(schema: &Value, live: &Value, owned: &Value) -> Owners {
             ("before-first-apply", apply::all_of(schema, &said))
         }
     };
-    let manager =
-        Manager { name: name.to_owned(), operation: Operation::Update, subresource: String::new() };
+    let manager = Manager {
+        name: name.to_owned(),
+        operation: Operation::Update,
+        subresource: String::new(),
+        version: entry.info.api_version(),
+    };
     let time = live["metadata"]["creationTimestamp"].as_str().unwrap_or_default().to_owned();
     Owners::from([(manager, Owned { fields, time })])
 }
@@ -223,7 +240,6 @@ fn all_kubectls(schema: &Value, live: &Value, conflicts: &[Conflict]) -> bool {
 }
 
 fn conflict(entry: &Entry, config: &Value, conflicts: &[Conflict]) -> Failure {
-    let version = entry.info.api_version();
     let with = |conflict: &Conflict| {
         let with = format!("conflict with {:?}", conflict.manager.name);
         let through = match conflict.manager.subresource.as_str() {
@@ -233,6 +249,7 @@ fn conflict(entry: &Entry, config: &Value, conflicts: &[Conflict]) -> Failure {
         match conflict.manager.operation {
             Operation::Apply => format!("{with}{through}"),
             Operation::Update => {
+                let version = &conflict.manager.version;
                 format!("{with}{through} using {version} at {}", conflict.time)
             }
         }

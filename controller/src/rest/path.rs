@@ -5,6 +5,7 @@ use http::{Method, Uri};
 use super::discovery::{self, ApiGroup};
 use super::failure::Failure;
 use super::metrics_api::{self, Measured};
+use super::query::Query;
 use super::registry::{self, Entry, View};
 use super::review::Review;
 use crate::objects::NODES;
@@ -106,6 +107,10 @@ pub enum Subresource {
     Scale,
     /// `…/eviction`
     Eviction,
+    /// `…/exec`
+    Exec,
+    /// `…/attach`
+    Attach,
 }
 
 /// One object, or a collection when `name` is `None`.
@@ -128,13 +133,23 @@ impl Object {
     pub(crate) fn allows(&self, verb: Verb) -> bool {
         match self.subresource {
             Some(Subresource::Log | Subresource::Why | Subresource::Pose) => verb == Verb::Get,
-            Some(Subresource::Fence | Subresource::Eviction) => verb == Verb::Create,
+            Some(
+                Subresource::Fence
+                | Subresource::Eviction
+                | Subresource::Exec
+                | Subresource::Attach,
+            ) => verb == Verb::Create,
             Some(Subresource::Scale) => matches!(verb, Verb::Get | Verb::Update | Verb::Patch),
             Some(Subresource::Status) => {
                 self.entry.info.has_status
                     && (verb == Verb::Get
                         || self.entry.verbs.contains(&verb)
                             && matches!(verb, Verb::Update | Verb::Patch))
+            }
+            // As in Kubernetes: all of a kind in all namespaces is not ended by one request.
+            None if verb == Verb::DeleteCollection => {
+                let everywhere = self.entry.info.namespaced && self.namespace.is_none();
+                self.entry.verbs.contains(&verb) && !everywhere
             }
             None => self.entry.verbs.contains(&verb),
         }
@@ -153,6 +168,8 @@ pub(crate) enum Target {
     Plan,
     /// What objects have wrong only all together.
     Check,
+    /// Several objects in one commit.
+    Transaction,
     /// What nodes and tasks use now.
     Usage,
     /// What nodes and tasks use now, for `kubectl top`.
@@ -181,6 +198,7 @@ impl Target {
             Self::Join => Some("join"),
             Self::Plan => Some("plan"),
             Self::Check => Some("check"),
+            Self::Transaction => Some("transaction"),
             Self::Usage => Some("usage"),
             Self::Offers => Some("offers"),
             Self::Poses => Some("poses"),
@@ -233,6 +251,7 @@ pub(crate) fn read(method: &Method, uri: &Uri) -> Result<(Verb, Target), Failure
             ["join"] => Target::Join,
             ["plan"] => Target::Plan,
             ["check"] => Target::Check,
+            ["transaction"] => Target::Transaction,
             ["usage"] => Target::Usage,
             ["offers"] => Target::Offers,
             ["poses"] => Target::Poses,
@@ -249,7 +268,15 @@ pub(crate) fn read(method: &Method, uri: &Uri) -> Result<(Verb, Target), Failure
         Target::Measured(measured) => measured.name.is_some(),
         _ => true,
     };
-    let verb = verb(method, uri, named).ok_or_else(|| Failure::method(method))?;
+    let verb = match (verb(method, uri, named).ok_or_else(|| Failure::method(method))?, &target) {
+        // A GET because WebSockets are; it is no reading.
+        (Verb::Get, Target::Objects(object))
+            if matches!(object.subresource, Some(Subresource::Exec | Subresource::Attach)) =>
+        {
+            Verb::Create
+        }
+        (verb, _) => verb,
+    };
     let read_only = matches!(
         target,
         Target::Health(_)
@@ -259,8 +286,10 @@ pub(crate) fn read(method: &Method, uri: &Uri) -> Result<(Verb, Target), Failure
             | Target::OpenApi(_)
             | Target::Usage
     );
-    let post_only =
-        matches!(target, Target::Join | Target::Plan | Target::Check | Target::Review(_));
+    let post_only = matches!(
+        target,
+        Target::Join | Target::Plan | Target::Check | Target::Transaction | Target::Review(_)
+    );
     let read_only =
         read_only || matches!(target, Target::Measured(_)) && !matches!(verb, Verb::List);
     let followed = matches!(target, Target::Poses) && !matches!(verb, Verb::List | Verb::Watch);
@@ -284,12 +313,10 @@ fn measured(parts: &[&str]) -> Option<Measured> {
 }
 
 fn verb(method: &Method, uri: &Uri, named: bool) -> Option<Verb> {
-    let watching = uri.query().is_some_and(|query| {
-        query.split('&').any(|pair| matches!(pair, "watch=true" | "watch=1" | "watch"))
-    });
+    let watching = || Query::read(uri).is_ok_and(|query| query.flag("watch"));
     Some(match (method.as_str(), named) {
         ("GET" | "HEAD", true) => Verb::Get,
-        ("GET" | "HEAD", false) if watching => Verb::Watch,
+        ("GET" | "HEAD", false) if watching() => Verb::Watch,
         ("GET" | "HEAD", false) => Verb::List,
         ("POST", _) => Verb::Create,
         ("PUT", true) => Verb::Update,
@@ -329,6 +356,8 @@ fn object(group: &str, parts: &[&str]) -> Option<Object> {
             Some(Subresource::Pose)
         }
         Some("eviction") if entry.info.kind == "Pod" => Some(Subresource::Eviction),
+        Some("exec") if entry.info.kind == "Pod" => Some(Subresource::Exec),
+        Some("attach") if entry.info.kind == "Pod" => Some(Subresource::Attach),
         Some("scale") if entry.info.kind == "TaskSet" => Some(Subresource::Scale),
         Some(_) => return None,
     };
@@ -365,6 +394,11 @@ mod tests {
         let cases = [
             ("GET", format!("{g}/tasks"), "list tasks ns=None name=None sub=None"),
             ("GET", format!("{g}/tasks?watch=true"), "watch tasks ns=None name=None sub=None"),
+            // Python's client writes it so.
+            ("GET", format!("{g}/tasks?watch=True"), "watch tasks ns=None name=None sub=None"),
+            ("GET", format!("{g}/tasks?limit=1&watch"), "watch tasks ns=None name=None sub=None"),
+            ("GET", format!("{g}/tasks?watch=False"), "list tasks ns=None name=None sub=None"),
+            ("GET", format!("{g}/tasks?watch=0"), "list tasks ns=None name=None sub=None"),
             (
                 "POST",
                 format!("{g}/namespaces/a/tasks"),
@@ -416,6 +450,17 @@ mod tests {
                 "/api/v1/namespaces/a/pods/t/eviction".into(),
                 "create tasks ns=Some(\"a\") name=Some(\"t\") sub=Some(Eviction)",
             ),
+            (
+                "GET",
+                "/api/v1/namespaces/a/pods/t/exec?command=ls&stdout=true".into(),
+                "create tasks ns=Some(\"a\") name=Some(\"t\") sub=Some(Exec)",
+            ),
+            (
+                "POST",
+                "/api/v1/namespaces/a/pods/t/attach".into(),
+                "create tasks ns=Some(\"a\") name=Some(\"t\") sub=Some(Attach)",
+            ),
+            ("GET", format!("{g}/namespaces/a/tasks/t/exec"), "404"),
             ("GET", "/api/v1/nodes/n/pose".into(), "404"),
             ("GET", "/apis/metrics.k8s.io/v1beta1/things".into(), "404"),
             ("POST", "/openapi/v3".into(), "405"),

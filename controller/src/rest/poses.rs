@@ -13,7 +13,6 @@ use std::collections::HashSet;
 use std::sync::Arc;
 use std::time::Duration;
 
-use axum::body::Body;
 use bytes::Bytes;
 use futures::stream;
 use http::StatusCode;
@@ -38,8 +37,6 @@ use crate::session::poses::LivePoses;
 const EVERY: Duration = Duration::from_millis(25);
 /// Robots in a piece of an answer, some 64 KiB: what comes after it is read when the reader has taken it.
 const PIECE: usize = 512;
-/// As in watches of objects.
-const DEFAULT_TIMEOUT: Duration = Duration::from_secs(45 * 60);
 
 /// Which robots are asked for.
 #[derive(Debug, Default)]
@@ -156,7 +153,6 @@ pub(super) fn of_node(call: &Call, target: &Object) -> Answer {
 /// GET …/poses?watch=true.
 pub(super) fn watch(call: &Call) -> Answer {
     let poses = Arc::clone(&super::question::live(&call.context)?.poses);
-    let seconds = call.query.parse::<u64>("timeoutSeconds")?.filter(|s| *s > 0);
     let following = Following {
         changed: poses.subscribe(),
         poses,
@@ -166,14 +162,13 @@ pub(super) fn watch(call: &Call) -> Answer {
         initial: true,
         shown: Vec::new(),
         not_before: Instant::now(),
-        end: Instant::now() + seconds.map_or(DEFAULT_TIMEOUT, Duration::from_secs),
+        end: Instant::now() + call.query.lasts()?,
         stop: call.context.stop.clone(),
     };
-    let body = Body::from_stream(stream::unfold(following, |mut following| async move {
-        let piece = following.next().await?;
-        Some((Ok::<_, std::convert::Infallible>(piece), following))
-    }));
-    Ok(super::raw(StatusCode::OK, body))
+    let pieces = stream::unfold(following, |mut following| async move {
+        Some((following.next().await?, following))
+    });
+    Ok(super::raw(StatusCode::OK, call.context.streams.follow(pieces)?))
 }
 
 /// A watch in progress.

@@ -44,18 +44,84 @@ struct ObjectMeta {
     uid: String,
     #[prost(string, tag = "6")]
     resource_version: String,
+    #[prost(int64, optional, tag = "7")]
+    generation: Option<i64>,
+    #[prost(message, optional, tag = "8")]
+    creation_timestamp: Option<Time>,
+    #[prost(message, optional, tag = "9")]
+    deletion_timestamp: Option<Time>,
+    #[prost(int64, optional, tag = "10")]
+    deletion_grace_period_seconds: Option<i64>,
     #[prost(btree_map = "string, string", tag = "11")]
     labels: BTreeMap<String, String>,
     #[prost(btree_map = "string, string", tag = "12")]
     annotations: BTreeMap<String, String>,
+    #[prost(message, repeated, tag = "13")]
+    owner_references: Vec<OwnerReference>,
     #[prost(string, repeated, tag = "14")]
     finalizers: Vec<String>,
+    #[prost(message, repeated, tag = "17")]
+    managed_fields: Vec<ManagedFieldsEntry>,
+}
+
+#[derive(Clone, PartialEq, Message)]
+struct Time {
+    #[prost(int64, tag = "1")]
+    seconds: i64,
+}
+
+#[derive(Clone, PartialEq, Message)]
+struct OwnerReference {
+    #[prost(string, tag = "1")]
+    kind: String,
+    #[prost(string, tag = "3")]
+    name: String,
+    #[prost(string, tag = "4")]
+    uid: String,
+    #[prost(string, tag = "5")]
+    api_version: String,
+    #[prost(bool, optional, tag = "6")]
+    controller: Option<bool>,
+    #[prost(bool, optional, tag = "7")]
+    block_owner_deletion: Option<bool>,
+}
+
+#[derive(Clone, PartialEq, Message)]
+struct ManagedFieldsEntry {
+    #[prost(string, tag = "1")]
+    manager: String,
+    #[prost(string, tag = "2")]
+    operation: String,
+    #[prost(string, tag = "3")]
+    api_version: String,
+    #[prost(message, optional, tag = "4")]
+    time: Option<Time>,
+    #[prost(string, tag = "6")]
+    fields_type: String,
+    #[prost(message, optional, tag = "7")]
+    fields_v1: Option<FieldsV1>,
+    #[prost(string, tag = "8")]
+    subresource: String,
+}
+
+#[derive(Clone, PartialEq, Message)]
+struct FieldsV1 {
+    #[prost(bytes = "vec", tag = "1")]
+    raw: Vec<u8>,
 }
 
 #[derive(Clone, PartialEq, Message)]
 struct Namespace {
     #[prost(message, optional, tag = "1")]
     metadata: Option<ObjectMeta>,
+    #[prost(message, optional, tag = "2")]
+    spec: Option<NamespaceSpec>,
+}
+
+#[derive(Clone, PartialEq, Message)]
+struct NamespaceSpec {
+    #[prost(string, repeated, tag = "1")]
+    finalizers: Vec<String>,
 }
 
 #[derive(Clone, PartialEq, Message)]
@@ -157,7 +223,7 @@ pub(super) fn json(bytes: &[u8]) -> Result<Value, Failure> {
     let kind = unknown.kind.unwrap_or_default();
     let raw = &*unknown.raw;
     let mut object = match kind.kind.as_str() {
-        "Namespace" => Namespace::decode(raw).map(|o| json!({"metadata": metadata(o.metadata)})),
+        "Namespace" => Namespace::decode(raw).map(namespace),
         "ConfigMap" => ConfigMap::decode(raw).map(config_map),
         "Secret" => Secret::decode(raw).map(secret),
         "DeleteOptions" => DeleteOptions::decode(raw).map(delete_options),
@@ -198,10 +264,80 @@ fn metadata(metadata: Option<ObjectMeta>) -> Value {
             fields.insert(field.into(), json!(map));
         }
     }
+    for (field, number) in [
+        ("generation", metadata.generation),
+        ("deletionGracePeriodSeconds", metadata.deletion_grace_period_seconds),
+    ] {
+        // Generations begin with 1; a grace of nothing is one.
+        if let Some(number) = number.filter(|number| *number != 0 || field != "generation") {
+            fields.insert(field.into(), number.into());
+        }
+    }
+    for (field, time) in [
+        ("creationTimestamp", metadata.creation_timestamp),
+        ("deletionTimestamp", metadata.deletion_timestamp),
+    ] {
+        if let Some(time) = time.and_then(rfc3339) {
+            fields.insert(field.into(), time.into());
+        }
+    }
     if !metadata.finalizers.is_empty() {
         fields.insert("finalizers".into(), json!(metadata.finalizers));
     }
+    let owners: Vec<Value> = metadata.owner_references.into_iter().map(owner).collect();
+    let managed: Vec<Value> = metadata.managed_fields.into_iter().map(managed).collect();
+    for (field, list) in [("ownerReferences", owners), ("managedFields", managed)] {
+        if !list.is_empty() {
+            fields.insert(field.into(), list.into());
+        }
+    }
     fields.into()
+}
+
+/// None: a time that there is not, as that of an object that is not created yet.
+fn rfc3339(time: Time) -> Option<String> {
+    let at = jiff::Timestamp::from_second(time.seconds).ok()?;
+    (time.seconds > 0).then(|| at.strftime("%Y-%m-%dT%H:%M:%SZ").to_string())
+}
+
+/// The members that say something.
+fn saying(members: impl IntoIterator<Item = (&'static str, Value)>) -> Value {
+    let says = |value: &Value| !value.is_null() && value != "";
+    let members = members.into_iter().filter(|(_, value)| says(value));
+    members.map(|(name, value)| (name.to_owned(), value)).collect::<Map<_, _>>().into()
+}
+
+fn owner(owner: OwnerReference) -> Value {
+    saying([
+        ("apiVersion", owner.api_version.into()),
+        ("kind", owner.kind.into()),
+        ("name", owner.name.into()),
+        ("uid", owner.uid.into()),
+        ("controller", json!(owner.controller)),
+        ("blockOwnerDeletion", json!(owner.block_owner_deletion)),
+    ])
+}
+
+fn managed(entry: ManagedFieldsEntry) -> Value {
+    let fields = entry.fields_v1.and_then(|fields| serde_json::from_slice(&fields.raw).ok());
+    saying([
+        ("manager", entry.manager.into()),
+        ("operation", entry.operation.into()),
+        ("apiVersion", entry.api_version.into()),
+        ("time", json!(entry.time.and_then(rfc3339))),
+        ("fieldsType", entry.fields_type.into()),
+        ("fieldsV1", fields.unwrap_or_default()),
+        ("subresource", entry.subresource.into()),
+    ])
+}
+
+fn namespace(namespace: Namespace) -> Value {
+    let mut object = json!({"metadata": metadata(namespace.metadata)});
+    let finalizers = namespace.spec.map(|spec| spec.finalizers).unwrap_or_default();
+    if !finalizers.is_empty() {
+        object["spec"] = json!({"finalizers": finalizers});
+    }
+    object
 }
 
 fn encoded(map: BTreeMap<String, Vec<u8>>) -> Value {
@@ -295,6 +431,39 @@ mod tests {
             json(&sent("v1", "Secret", &secret)).unwrap(),
             json!({"apiVersion": "v1", "kind": "Secret", "metadata": {"name": "x"},
                    "data": {"p": "cQ=="}, "type": "Opaque"})
+        );
+        let metadata = ObjectMeta {
+            name: "x".into(),
+            creation_timestamp: Some(Time { seconds: 1_700_000_000 }),
+            owner_references: vec![OwnerReference {
+                kind: "TaskSet".into(),
+                name: "watch".into(),
+                uid: "u".into(),
+                api_version: "muster.dev/v1alpha1".into(),
+                controller: Some(true),
+                block_owner_deletion: Some(false),
+            }],
+            managed_fields: vec![ManagedFieldsEntry {
+                manager: "kubectl".into(),
+                operation: "Apply".into(),
+                api_version: "v1".into(),
+                time: Some(Time { seconds: 1_700_000_000 }),
+                fields_type: "FieldsV1".into(),
+                fields_v1: Some(FieldsV1 { raw: br#"{"f:data":{}}"#.to_vec() }),
+                subresource: String::new(),
+            }],
+            ..ObjectMeta::default()
+        };
+        let map = ConfigMap { metadata: Some(metadata), ..ConfigMap::default() };
+        assert_eq!(
+            json(&sent("v1", "ConfigMap", &map)).unwrap()["metadata"],
+            json!({
+                "name": "x", "creationTimestamp": "2023-11-14T22:13:20Z",
+                "ownerReferences": [{"apiVersion": "muster.dev/v1alpha1", "kind": "TaskSet",
+                    "name": "watch", "uid": "u", "controller": true, "blockOwnerDeletion": false}],
+                "managedFields": [{"manager": "kubectl", "operation": "Apply", "apiVersion": "v1",
+                    "time": "2023-11-14T22:13:20Z", "fieldsType": "FieldsV1", "fieldsV1": {"f:data": {}}}],
+            })
         );
         let resource =
             ResourceAttributes { verb: "create".into(), ..ResourceAttributes::default() };

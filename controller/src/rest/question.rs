@@ -1,5 +1,6 @@
 //! Answers that are no objects: what would be decided, why a task waits, what is used now.
 
+use std::collections::HashMap;
 use std::sync::Arc;
 
 use http::StatusCode;
@@ -14,9 +15,10 @@ use serde_json::{Value, json};
 
 use super::failure::Failure;
 use super::path::Object;
-use super::{Answer, Call, body, registry};
+use super::{Answer, Call, body, registry, sets};
 use crate::context::{Context, Live};
 use crate::objects::TASKS;
+use crate::session::frameworks::owner_of;
 use crate::store::Key;
 use crate::{configs, depends, objects, quota};
 
@@ -72,6 +74,7 @@ pub(super) async fn why(call: Call, target: Object) -> Answer {
         let demand = Demand {
             uid: TaskUid::new(&*stored.uid),
             title: title.into(),
+            framework: owner_of(&task.metadata),
             spec: Arc::new(task.spec),
             since: 0,
             avoid: Arc::default(),
@@ -97,18 +100,23 @@ pub(super) async fn plan(call: Call) -> Answer {
     let objects = body.get("objects").and_then(Value::as_array);
     let objects =
         objects.ok_or_else(|| Failure::bad_request("the body must be {\"objects\": […]}"))?;
+    body::check_count(objects.len())?;
     let revision = context.store.revision();
-    let (mut changes, mut demands) = (Vec::new(), Vec::new());
+    let (mut changes, mut demands, mut outcomes) = (Vec::new(), Vec::new(), Vec::new());
     for (i, object) in objects.iter().enumerate() {
         let object = with_defaults(&context, object);
         let object = muster_api::kind::admit(&object).map_err(|v| refused(i, v))?;
         let change = change_of(&context, &object)?;
         if object["kind"] == "Task" && change["action"] == "create" {
             demands.push(demand(i, &object)?);
+        } else if object["kind"] == "TaskSet" && change["action"] != "unchanged" {
+            let (outcome, begins) = sets::outcome(&context, &object)?;
+            outcomes.push(outcome);
+            demands.extend(begins);
         }
         changes.push(change);
     }
-    let names: Vec<(TaskUid, Value)> = demands
+    let names: HashMap<TaskUid, Value> = demands
         .iter()
         .map(|d| {
             let (namespace, name) = d.title.split_once('/').unwrap_or_default();
@@ -116,9 +124,14 @@ pub(super) async fn plan(call: Call) -> Answer {
         })
         .collect();
     let (held, demands) = hold_back(&context, objects, demands);
-    let mut plan = live(&context)?.scheduler.plan(demands).await.map_err(ended)?;
+    let (mut plan, seen) = live(&context)?.scheduler.plan(demands).await.map_err(ended)?;
+    // Whatever was written after this may not be in it.
+    let revision = revision.min(seen);
     plan.waits.extend(held);
-    let answer = describe(&names, &plan, changes, revision);
+    let mut answer = describe(&context, &names, &plan);
+    answer["changes"] = changes.into();
+    answer["sets"] = outcomes.into();
+    answer["revision"] = revision.to_string().into();
     Ok(super::json(StatusCode::OK, &answer))
 }
 
@@ -153,7 +166,7 @@ fn hold_back(
             free.push(demand);
         } else {
             let why = holds.iter().map(Hold::refusal).collect();
-            held.push(Wait { uid: demand.uid, why });
+            held.push(Wait { uid: demand.uid, why, brief: false });
         }
     }
     (held, free)
@@ -210,6 +223,7 @@ fn demand(index: usize, object: &Value) -> Result<Demand, Failure> {
     Ok(Demand {
         uid: TaskUid::new(format!("plan-{index}")),
         title: format!("{namespace}/{name}").into(),
+        framework: owner_of(&task.metadata),
         spec: Arc::new(task.spec),
         // After everything that waits.
         since: u64::MAX / 2 + index as u64,
@@ -217,10 +231,9 @@ fn demand(index: usize, object: &Value) -> Result<Demand, Failure> {
     })
 }
 
-fn describe(names: &[(TaskUid, Value)], plan: &Plan, changes: Vec<Value>, revision: u64) -> Value {
+fn describe(context: &Context, names: &HashMap<TaskUid, Value>, plan: &Plan) -> Value {
     let with_name = |uid: &TaskUid, fields: Value| {
-        let mut named =
-            names.iter().find(|(u, _)| u == uid).map_or_else(|| json!({}), |(_, n)| n.clone());
+        let mut named = names.get(uid).cloned().unwrap_or_else(|| json!({}));
         if let (Some(named), Value::Object(fields)) = (named.as_object_mut(), fields) {
             named.extend(fields);
         }
@@ -248,12 +261,14 @@ fn describe(names: &[(TaskUid, Value)], plan: &Plan, changes: Vec<Value>, revisi
         .iter()
         .map(|preemption| {
             let victims: Vec<&str> = preemption.victims.iter().map(|v| &*v.title).collect();
-            let fields = json!({ "node": preemption.node.as_str(), "victims": victims });
+            // Each passes on when its holder's processes are gone.
+            let lost = victims.iter().filter_map(|victim| victim.split_once('/'));
+            let lost = lost.flat_map(|(ns, name)| sets::leases_of(&context.store, ns, name));
+            let lost: Vec<String> = lost.collect();
+            let fields =
+                json!({ "node": preemption.node.as_str(), "victims": victims, "leases": lost });
             with_name(&preemption.uid, fields)
         })
         .collect();
-    json!({
-        "changes": changes, "placements": placements, "waits": waits, "preemptions": preemptions,
-        "revision": revision.to_string(),
-    })
+    json!({ "placements": placements, "waits": waits, "preemptions": preemptions })
 }

@@ -36,7 +36,7 @@ const ALL: &[Verb] = &[
 ];
 
 /// How what is stored is shown as this kind.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub(crate) enum View {
     /// As it is.
     Stored,
@@ -110,7 +110,7 @@ static ENTRIES: LazyLock<Vec<Entry>> = LazyLock::new(|| {
     let stored = kind::ALL.iter().map(entry);
     let pods = Entry {
         resource: TASKS,
-        verbs: READ_AND_REMOVE,
+        verbs: ALL_BUT_CREATE,
         has_log: true,
         view: View::Pod,
         ..entry(&projected::POD)
@@ -121,7 +121,8 @@ static ENTRIES: LazyLock<Vec<Entry>> = LazyLock::new(|| {
         view: View::Node,
         ..entry(&projected::NODE)
     };
-    stored.chain([pods, nodes]).collect()
+    let services = Entry { verbs: READ, ..entry(&projected::SERVICE) };
+    stored.chain([pods, nodes, services]).collect()
 });
 
 fn entry(info: &'static KindInfo) -> Entry {

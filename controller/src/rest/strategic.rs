@@ -3,6 +3,8 @@
 //! Of the lists in what is written through core kinds here, only those of `metadata` are merged; the others are replaced
 //! whole, as in Kubernetes (taints are such a list).
 
+use std::collections::{BTreeMap, BTreeSet};
+
 use serde_json::{Map, Value};
 
 use super::failure::Failure;
@@ -32,14 +34,16 @@ fn fields(target: &mut Value, patch: &Map<String, Value>) -> Result<(), Failure>
     }
     let Some(members) = target.as_object_mut() else { return Ok(()) };
     if let Some(kept) = patch.get("$retainKeys").and_then(Value::as_array) {
-        members.retain(|name, _| kept.iter().any(|kept| kept == name));
+        let kept: BTreeSet<&str> = kept.iter().filter_map(Value::as_str).collect();
+        members.retain(|name, _| kept.contains(name.as_str()));
     }
     for (name, value) in patch {
         if let Some(list) = name.strip_prefix("$deleteFromPrimitiveList/") {
             if let (Some(Value::Array(present)), Value::Array(gone)) =
                 (members.get_mut(list), value)
             {
-                present.retain(|element| !gone.contains(element));
+                let gone = values(gone);
+                present.retain(|element| !gone.contains(&element.to_string()));
             }
             continue;
         }
@@ -61,32 +65,67 @@ fn fields(target: &mut Value, patch: &Map<String, Value>) -> Result<(), Failure>
     Ok(())
 }
 
+/// A list that is merged: by uid, or by value. The last word about an element counts.
 fn list(name: &str, present: Option<&Vec<Value>>, said: &[Value]) -> Vec<Value> {
-    let mut merged = match name {
-        "finalizers" | "ownerReferences" => present.cloned().unwrap_or_default(),
-        _ => Vec::new(),
+    let key = |element: &Value| match name {
+        "ownerReferences" => element["uid"].to_string(),
+        _ => element.to_string(),
     };
-    for element in said {
-        let same = |other: &Value| match name {
-            "ownerReferences" => other["uid"] == element["uid"],
-            _ => other == element,
-        };
-        match name {
-            "finalizers" | "ownerReferences" => merged.retain(|other| !same(other)),
-            _ => {}
-        }
-        if element.get("$patch").is_none() {
-            merged.push(element.clone());
-        }
+    let stays = |element: &Value| element.get("$patch").is_none();
+    if !matches!(name, "finalizers" | "ownerReferences") {
+        return said.iter().filter(|element| stays(element)).cloned().collect();
     }
-    merged
+    let last: BTreeMap<String, usize> =
+        said.iter().enumerate().map(|(place, element)| (key(element), place)).collect();
+    let kept = present.into_iter().flatten().filter(|element| !last.contains_key(&key(element)));
+    let new = said.iter().enumerate();
+    let new = new.filter(|(place, element)| last.get(&key(element)) == Some(place));
+    kept.chain(new.map(|(_, element)| element).filter(|element| stays(element))).cloned().collect()
+}
+
+/// The values, to be looked up.
+fn values(list: &[Value]) -> BTreeSet<String> {
+    list.iter().map(ToString::to_string).collect()
 }
 
 #[cfg(test)]
 mod tests {
+    use proptest::prelude::*;
     use serde_json::json;
 
     use super::*;
+
+    /// As the words say it: each element of the patch takes the place of those that are the same.
+    fn one_by_one(present: &[Value], said: &[Value]) -> Vec<Value> {
+        let mut merged = present.to_vec();
+        for element in said {
+            merged.retain(|other| other["uid"] != element["uid"]);
+            if element.get("$patch").is_none() {
+                merged.push(element.clone());
+            }
+        }
+        merged
+    }
+
+    proptest! {
+        #[test]
+        fn a_merged_list_is_as_if_merged_one_by_one(
+            present in prop::collection::vec((0..6_u8, 0..3_u8), 0..8),
+            said in prop::collection::vec((0..6_u8, 0..3_u8, any::<bool>()), 0..8),
+        ) {
+            let owner = |uid: u8, name: u8| json!({"uid": uid.to_string(), "name": name});
+            let present: Vec<Value> = present.into_iter().map(|(uid, n)| owner(uid, n)).collect();
+            let said: Vec<Value> = said.into_iter().map(|(uid, n, gone)| {
+                let mut element = owner(uid, n);
+                if gone {
+                    element["$patch"] = "delete".into();
+                }
+                element
+            }).collect();
+            let merged = list("ownerReferences", Some(&present), &said);
+            prop_assert_eq!(merged, one_by_one(&present, &said));
+        }
+    }
 
     #[test]
     fn directives_are_followed() {

@@ -32,6 +32,7 @@ pub(super) async fn check(call: Call) -> Answer {
     let objects = body.get("objects").and_then(Value::as_array);
     let objects =
         objects.ok_or_else(|| Failure::bad_request("the body must be {\"objects\": […]}"))?;
+    body::check_count(objects.len())?;
     let mut refusals: Vec<(usize, Value)> = Vec::new();
     for (namespace, asking) in new_tasks(&context, objects)? {
         let Some(quota) = quota_of(&context, objects, &namespace) else { continue };
@@ -74,7 +75,7 @@ fn new_tasks(
 }
 
 /// The quota that there is when the tasks come: one among the objects is stored before them.
-fn quota_of(context: &Context, objects: &[Value], namespace: &str) -> Option<QuotaSpec> {
+pub(super) fn quota_of(context: &Context, objects: &[Value], namespace: &str) -> Option<QuotaSpec> {
     let planned = objects::among(objects, "Quota", (namespace, QUOTA_NAME));
     let planned = planned.and_then(|object| serde_json::from_value::<Quota>(object.clone()).ok());
     planned.map(|quota| quota.spec).or_else(|| quota::of(&context.store, namespace))

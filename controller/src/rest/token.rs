@@ -6,6 +6,7 @@
 
 use http::StatusCode;
 use jiff::{SignedDuration, Timestamp};
+use muster_api::secret::same;
 use ring::rand::SecureRandom as _;
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
@@ -186,7 +187,7 @@ pub(super) async fn spend(
     let spent = context.store.update(&key, |_, value| {
         let mut record: Record =
             serde_json::from_value(value).map_err(|_| refused("its record is damaged"))?;
-        if !same(&record.secret_sha256, &hash(secret)) {
+        if !same(record.secret_sha256.as_bytes(), hash(secret).as_bytes()) {
             // The same words as for an id that does not exist: ids are not to be probed.
             return Err(refused("it is not known here"));
         }
@@ -246,11 +247,6 @@ fn public(stored: &Stored) -> Option<Value> {
 
 fn hash(secret: &str) -> String {
     hex(ring::digest::digest(&ring::digest::SHA256, secret.as_bytes()).as_ref())
-}
-
-/// Compares two hashes. Both sides are hashes, so what timing could tell is of no use; still, all of it is looked at.
-fn same(a: &str, b: &str) -> bool {
-    a.len() == b.len() && a.bytes().zip(b.bytes()).fold(0, |diff, (a, b)| diff | (a ^ b)) == 0
 }
 
 fn random<const N: usize>() -> Result<[u8; N], Failure> {

@@ -7,6 +7,7 @@ use muster_api::kind;
 use muster_api::kind::application::Application;
 use muster_api::kind::namespace::Namespace;
 use muster_api::kind::node::Node;
+use muster_api::kind::quota::Quota;
 use muster_api::kind::task::Task;
 use muster_api::kind::taskset::TaskSet;
 use muster_api::validate::Violations;
@@ -17,7 +18,7 @@ use super::create::with_warnings;
 use super::owners::Writer;
 use super::path::{Object, Subresource};
 use super::query::FieldValidation;
-use super::registry::Entry;
+use super::registry::{Entry, View};
 use super::{Answer, Call, admission, body, failure::Failure, metadata, owners};
 use crate::context::Context;
 use crate::store::{Op, Precondition, Store, StoreError, Stored};
@@ -34,20 +35,23 @@ pub(super) struct Options {
 
 impl Options {
     pub(super) fn read(call: &Call, target: &Object) -> Result<Self, Failure> {
-        Ok(Self {
-            mode: call.query.field_validation()?,
-            dry: call.query.dry_run()?,
-            writer: Writer {
-                name: manager(call),
-                subresource: match target.subresource {
-                    Some(Subresource::Status) => "status",
-                    Some(Subresource::Scale) => "scale",
-                    _ => "",
-                },
-                time: call.context.stamp(),
-            },
-            applies: false,
-        })
+        let mut options = Self::of_call(call)?;
+        options.writer.subresource = match target.subresource {
+            Some(Subresource::Status) => "status",
+            Some(Subresource::Scale) => "scale",
+            _ => "",
+        };
+        let entry = target.entry;
+        options.writer.view = (entry.view != View::Stored).then(|| entry.info.api_version());
+        Ok(options)
+    }
+
+    /// Of whole objects.
+    pub(super) fn of_call(call: &Call) -> Result<Self, Failure> {
+        let (name, time) = (manager(call), call.context.stamp());
+        let writer = Writer { name, subresource: "", view: None, time };
+        let (mode, dry) = (call.query.field_validation()?, call.query.dry_run()?);
+        Ok(Self { mode, dry, writer, applies: false })
     }
 }
 
@@ -86,7 +90,7 @@ pub(super) async fn change(
             Ok(with_warnings(super::raw(StatusCode::OK, bytes), next.warnings.clone()))
         };
         if options.dry {
-            return done(next.object.to_string().into());
+            return done(admission::render(&next.object)?);
         }
         match write(&context.store, &present, &next.object).await {
             Ok(stored) => return done(stored.bytes.clone()),
@@ -102,22 +106,40 @@ async fn write(
     present: &Arc<Stored>,
     object: &Value,
 ) -> Result<Arc<Stored>, StoreError> {
+    match operation(present, object) {
+        Some(op) => store.apply_one(op).await,
+        None => Ok(Arc::clone(present)),
+    }
+}
+
+/// The same as an operation, while the object is what it was; none: nothing changed.
+pub(super) fn operation(present: &Stored, object: &Value) -> Option<Op> {
     let old = present.value();
     if *object == old {
-        return Ok(Arc::clone(present));
+        return None;
     }
     let let_go = metadata::is_ending(object)
         && metadata::has_finalizers(&old)
         && !metadata::has_finalizers(object)
-        && !super::delete::is_held(present.key.resource, object);
+        && !super::delete::is_held(present.key.resource, object)
+        && !super::namespace::is_ours_to_end(present.key.resource);
     let key = present.key.clone();
     let precondition = Precondition::revision(present.revision);
-    let op = if let_go {
+    Some(if let_go {
         Op::Delete { key, precondition }
     } else {
         Op::Put { key, value: object.clone(), precondition }
-    };
-    store.apply_one(op).await
+    })
+}
+
+/// What an object becomes by `make`, as [`change`] would store it.
+pub(super) fn becomes(
+    target: &Object,
+    present: &Stored,
+    options: &Options,
+    make: impl Fn(&Value) -> Result<Value, Failure>,
+) -> Result<Value, Failure> {
+    next(target, present, options, make).map(|next| next.object)
 }
 
 struct Next {
@@ -148,6 +170,7 @@ fn next(
             (_, None) => {}
         }
         check_status(entry, name, &object)?;
+        admission::check_depth(&object)?;
         let said = new["metadata"].get("managedFields").cloned();
         set_owners(entry, &old, &mut object, said, options);
         return Ok(Next { object, warnings: Vec::new(), pinned });
@@ -197,6 +220,7 @@ fn check_status(entry: &Entry, name: &str, object: &Value) -> Result<(), Failure
         "TaskSet" => TaskSet::deserialize(object).map(drop),
         "Node" => Node::deserialize(object).map(drop),
         "Namespace" => Namespace::deserialize(object).map(drop),
+        "Quota" => Quota::deserialize(object).map(drop),
         _ => Ok(()),
     };
     read.map_err(|error| {

@@ -12,9 +12,8 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
-use futures::Stream;
+use futures::{Stream, StreamExt as _, future};
 use muster_api::id::{Incarnation, TaskUid};
-use muster_api::kind::node::Node;
 use muster_api::name::NodeName;
 use muster_api::pose::Pose;
 use muster_api::wire::agent::v1 as wire;
@@ -22,7 +21,7 @@ use muster_api::wire::agent_session::{NodeReport, node_order};
 use muster_controller_core::node_health::{DETECT_AFTER, HEARTBEAT_EVERY};
 use muster_controller_core::stray::Strays;
 use tokio::sync::{Notify, mpsc, watch};
-use tokio_stream::wrappers::ReceiverStream;
+use tokio_stream::wrappers::{ReceiverStream, WatchStream};
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 use tonic::{Request, Response, Status, Streaming};
@@ -33,10 +32,11 @@ use super::nodes::{self, Speaker};
 use super::poses::LivePoses;
 use super::proto::agent_service_server::AgentService;
 use super::strays::lives;
-use super::{Connection, NodeUsage, Sessions, reports};
+use super::{Connection, NodeUsage, Sessions, relay, reports};
 use crate::auth::Identity;
 use crate::context::Context;
 use crate::objects;
+use crate::reconcile::images;
 
 /// An agent that connects says Hello at once.
 const HELLO_WITHIN: Duration = Duration::from_secs(10);
@@ -65,26 +65,11 @@ impl Agents {
     ) -> Self {
         Agents { context, sessions, poses, tasks, next_id: AtomicU64::new(1) }
     }
-}
 
-type Outbound = mpsc::Sender<Result<wire::ControllerMessage, Status>>;
-
-#[tonic::async_trait]
-impl AgentService for Agents {
-    type SessionStream =
-        Pin<Box<dyn Stream<Item = Result<wire::ControllerMessage, Status>> + Send>>;
-
-    async fn session(
-        &self,
-        request: Request<Streaming<wire::AgentMessage>>,
-    ) -> Result<Response<Self::SessionStream>, Status> {
-        let (node, key) = match request.extensions().get::<Identity>() {
-            Some(Identity::Node { name, key }) => (name.clone(), key.clone()),
-            _ => return Err(Status::unauthenticated("a node's client certificate is needed")),
-        };
-        let node = NodeName::new(node)
-            .map_err(|e| Status::unauthenticated(format!("the certificate's name {e}")))?;
-        let (to_agent, outbound) = mpsc::channel(OUTBOUND);
+    /// A session with the agent that showed the certificate of `node` with this `key`; gives what is said to it. Whatever
+    /// carries the messages keeps their order.
+    pub fn begin(&self, node: NodeName, key: String, inbound: Inbound) -> Told {
+        let (to_agent, told) = mpsc::channel(OUTBOUND);
         let session = Session {
             context: Arc::clone(&self.context),
             sessions: Arc::clone(&self.sessions),
@@ -94,16 +79,106 @@ impl AgentService for Agents {
             key,
             node_uid: "".into(),
             strays: Strays::default(),
-            inbound: request.into_inner(),
+            inbound,
             to_agent,
+            ended: CancellationToken::new(),
         };
         self.tasks.spawn(session.run());
-        Ok(Response::new(Box::pin(ReceiverStream::new(outbound))))
+        ReceiverStream::new(told)
+    }
+}
+
+/// What an agent says, in order. Dropping a wait for the next message loses none.
+pub type Inbound = Pin<Box<dyn Stream<Item = Result<wire::AgentMessage, Status>> + Send + Sync>>;
+
+/// What an agent is told.
+pub type Told = ReceiverStream<Result<wire::ControllerMessage, Status>>;
+
+type Outbound = mpsc::Sender<Result<wire::ControllerMessage, Status>>;
+
+#[tonic::async_trait]
+impl AgentService for Agents {
+    type SessionStream =
+        Pin<Box<dyn Stream<Item = Result<wire::ControllerMessage, Status>> + Send>>;
+    type MessagesStream = Pin<Box<dyn Stream<Item = Result<wire::Message, Status>> + Send>>;
+    type OrdersStream = Pin<Box<dyn Stream<Item = Result<wire::NodeOrder, Status>> + Send>>;
+
+    async fn session(
+        &self,
+        request: Request<Streaming<wire::AgentMessage>>,
+    ) -> Result<Response<Self::SessionStream>, Status> {
+        let (node, key) = peer(&request)?;
+        let outbound = self.begin(node, key, Box::pin(request.into_inner()));
+        Ok(Response::new(Box::pin(outbound)))
+    }
+
+    async fn orders(
+        &self,
+        request: Request<wire::OrdersRequest>,
+    ) -> Result<Response<Self::OrdersStream>, Status> {
+        let (node, key) = peer(&request)?;
+        // Followed before it is read: what changes in between is told.
+        let told = self.sessions.orders().follow(&node);
+        let (stored, object) =
+            nodes::admit(&self.context, &node, &key).map_err(|error| status(&error))?;
+        self.sessions.orders().say(&node, stored.revision, node_order(&object.spec));
+        let told = WatchStream::new(told).filter(|told| future::ready(told.revision > 0));
+        let told = told.map(|told| Ok(told.order));
+        let stop = self.context.stop.clone().cancelled_owned();
+        Ok(Response::new(Box::pin(told.take_until(stop))))
+    }
+
+    async fn messages(
+        &self,
+        request: Request<Streaming<wire::Message>>,
+    ) -> Result<Response<Self::MessagesStream>, Status> {
+        let (node, key) = peer(&request)?;
+        nodes::admit(&self.context, &node, &key).map_err(|error| status(&error))?;
+        let connection = self.sessions.connection(&node);
+        let connection = connection.ok_or_else(|| {
+            Status::failed_precondition("messages are carried beside a session; say Hello first")
+        })?;
+        let told = connection.relay.attach();
+        let heard = hear_messages(Arc::clone(&self.context), node, request.into_inner());
+        let until = (self.context.stop.clone(), connection.ended, told.over());
+        self.tasks.spawn(async move {
+            tokio::select! {
+                () = until.0.cancelled() => {}
+                () = until.1.cancelled() => {}
+                () = until.2.cancelled() => {}
+                () = heard => {}
+            }
+            until.2.cancel();
+        });
+        Ok(Response::new(Box::pin(told.map(Ok))))
+    }
+}
+
+/// Passes on what executors of a node say, to the end of the stream.
+async fn hear_messages(
+    context: Arc<Context>,
+    node: NodeName,
+    mut messages: Streaming<wire::Message>,
+) {
+    while let Some(Ok(message)) = messages.next().await {
+        if let Some(live) = context.live() {
+            live.frameworks.take_from_executor(&node, message);
+        }
+    }
+}
+
+/// The node of the client's certificate, and its key.
+fn peer<T>(request: &Request<T>) -> Result<(NodeName, String), Status> {
+    match request.extensions().get::<Identity>() {
+        Some(Identity::Node { name, key }) => NodeName::new(name.clone())
+            .map(|name| (name, key.clone()))
+            .map_err(|e| Status::unauthenticated(format!("the certificate's name {e}"))),
+        _ => Err(Status::unauthenticated("a node's client certificate is needed")),
     }
 }
 
 /// What others say to the agent through its session.
-struct Relayed {
+struct Beside {
     messages: mpsc::Receiver<wire::ControllerMessage>,
     tickets: watch::Receiver<wire::Tickets>,
 }
@@ -119,8 +194,10 @@ pub(super) struct Session {
     /// Of the Node for which this session speaks.
     node_uid: Box<str>,
     pub(super) strays: Strays,
-    inbound: Streaming<wire::AgentMessage>,
+    inbound: Inbound,
     to_agent: Outbound,
+    /// It has ended.
+    ended: CancellationToken,
 }
 
 /// Why a session ends other than by the agent's wish.
@@ -145,6 +222,7 @@ impl Session {
             Err(end) = self.serve() => end,
         };
         self.sessions.disconnect(&self.node, self.id);
+        self.ended.cancel();
         if let End::Because(status) = ended {
             tracing::debug!(node = %self.node, code = ?status.code(), message = status.message(), "session ended");
             // An agent that does not read any more need not be told.
@@ -163,22 +241,25 @@ impl Session {
         self.sessions.board().ready().await;
         let (outbound, messages) = mpsc::channel(OUTBOUND);
         let (to_agent, tickets) = watch::channel(wire::Tickets::default());
-        let mut relayed = Relayed { messages, tickets };
+        let mut beside = Beside { messages, tickets };
         let replaced = CancellationToken::new();
         let logs = Arc::default();
         let connection = Connection {
             id: self.id,
             outbound,
+            relay: relay::Relay::default(),
             tickets: to_agent,
             logs: Arc::clone(&logs),
             replaced: replaced.clone(),
+            ended: self.ended.clone(),
             written: Arc::default(),
         };
         let hello_written = Arc::clone(&connection.written);
         let sessions = Arc::clone(&self.sessions);
         let beginning = sessions.begin().await;
         // First of all: one that is not admitted must not end the session of one that is.
-        nodes::admit(&self.context, &speaker).map_err(|error| refused(&error))?;
+        nodes::admit(&self.context, &speaker.node, &speaker.key)
+            .map_err(|error| refused(&error))?;
         self.sessions.connect(&self.node, connection);
         // Heard before it is written that it is ready: whoever is about to write that it is silent looks
         // at this again, and must not overwrite the newer word with the older one.
@@ -187,11 +268,8 @@ impl Session {
         hello_written.store(true, Ordering::Release);
         drop(beginning);
         self.send(ToAgent::Welcome(welcome())).await?;
-        // What changes from now on comes from `reconcile::orders`, behind this.
-        let stored = self.context.store.get(&objects::node_key(self.node.as_str()));
-        if let Some(object) = stored.and_then(|stored| objects::read::<Node>(&stored)) {
-            self.send(ToAgent::Order(node_order(&object.spec))).await?;
-        }
+        // What changes from now on comes from `reconcile::images`, behind this.
+        self.send(ToAgent::Images(images::wanted_on(&self.context.store, &self.node))).await?;
         let wake = self.send_page(&hello.tasks).await?;
         for report in &hello.tasks {
             self.acknowledge(report).await?;
@@ -202,7 +280,7 @@ impl Session {
             "AgentConnected",
             format!("agent {} is connected", speaker.version),
         );
-        self.listen(&speaker, &wake, &mut relayed, &logs, &replaced).await
+        self.listen(&speaker, &wake, &mut beside, &logs, &replaced).await
     }
 
     /// What Hello says, written down. Strays are known before the node is called ready.
@@ -226,23 +304,23 @@ impl Session {
         &mut self,
         speaker: &Speaker,
         wake: &Notify,
-        relayed: &mut Relayed,
+        beside: &mut Beside,
         logs: &super::logs::Readers,
         replaced: &CancellationToken,
     ) -> Result<std::convert::Infallible, End> {
         loop {
             tokio::select! {
                 // Cancel safe: tonic keeps a half-read message in the stream.
-                message = self.inbound.message() => {
-                    let body = message.map_err(|_| End::Closed)?.ok_or(End::Closed)?.body;
+                message = self.inbound.next() => {
+                    let body = message.ok_or(End::Closed)?.map_err(|_| End::Closed)?.body;
                     self.take(body, speaker, logs).await?;
                 }
                 // Cancel safe: a permit that was not received stays.
                 () = wake.notified() => self.send_changed().await?,
-                Some(message) = relayed.messages.recv() => self.send_message(message).await?,
+                Some(message) = beside.messages.recv() => self.send_message(message).await?,
                 // Cancel safe: what was not marked as seen is a change again.
-                Ok(()) = relayed.tickets.changed() => {
-                    let tickets = relayed.tickets.borrow_and_update().clone();
+                Ok(()) = beside.tickets.changed() => {
+                    let tickets = beside.tickets.borrow_and_update().clone();
                     self.send(ToAgent::Tickets(tickets)).await?;
                 }
                 () = replaced.cancelled() => {
@@ -271,7 +349,7 @@ impl Session {
     }
 
     async fn next(&mut self) -> Result<FromAgent, End> {
-        let message = self.inbound.message().await.map_err(|_| End::Closed)?.ok_or(End::Closed)?;
+        let message = self.inbound.next().await.ok_or(End::Closed)?.map_err(|_| End::Closed)?;
         message.body.ok_or_else(|| Status::invalid_argument("a message without a body").into())
     }
 
@@ -301,12 +379,6 @@ impl Session {
                 let id = chunk.id;
                 if !logs.take(chunk) {
                     self.send(ToAgent::LogCancel(wire::LogCancel { id })).await?;
-                }
-                Ok(())
-            }
-            Some(FromAgent::Message(message)) => {
-                if let Some(live) = self.context.live() {
-                    live.frameworks.take_from_executor(&self.node, message);
                 }
                 Ok(())
             }
@@ -410,11 +482,15 @@ impl Session {
 
 /// Trying again does not help: a person has to do something first.
 fn refused(error: &nodes::NodeError) -> End {
+    End::Because(status(error))
+}
+
+fn status(error: &nodes::NodeError) -> Status {
     match error {
         nodes::NodeError::Deleted { .. } | nodes::NodeError::OtherAgent { .. } => {
-            End::Because(Status::permission_denied(error.to_string()))
+            Status::permission_denied(error.to_string())
         }
-        _ => End::Because(Status::failed_precondition(error.to_string())),
+        _ => Status::failed_precondition(error.to_string()),
     }
 }
 

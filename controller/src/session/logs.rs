@@ -7,7 +7,6 @@ use std::sync::{Arc, Mutex};
 use bytes::Bytes;
 use futures::future::BoxFuture;
 use futures::stream::{self, BoxStream, StreamExt as _};
-use jiff::SignedDuration;
 use muster_api::kind::task::Task;
 use muster_api::name::NodeName;
 use muster_api::wire::agent::v1 as wire;
@@ -116,14 +115,6 @@ impl SessionLogs {
         let name = NodeName::new(node.clone()).map_err(|_| unreachable())?;
         let connection = self.sessions.connection(&name).ok_or_else(unreachable)?;
         let (id, receiver) = connection.logs.begin();
-        let since = options.since_seconds.and_then(|s| {
-            let since = context
-                .clock
-                .now()
-                .checked_sub(SignedDuration::from_secs(i64::try_from(s).ok()?))
-                .ok()?;
-            Some(prost_time(since))
-        });
         let request = wire::LogRequest {
             id,
             uid: stored.uid.to_string(),
@@ -131,7 +122,7 @@ impl SessionLogs {
             previous: options.previous,
             tail_lines: options.tail_lines,
             timestamps: options.timestamps,
-            since,
+            since: options.since.map(prost_time),
         };
         let message =
             wire::ControllerMessage { body: Some(wire::controller_message::Body::Log(request)) };

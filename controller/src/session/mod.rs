@@ -15,15 +15,21 @@
 //! | [`reports`] | what an agent says of a task → the Task object and its lease |
 //! | [`frameworks`] | the sessions of frameworks |
 //! | [`poses`] | where robots are: their agents' word, and streams of a building's localisation |
+//! | [`orders`] | emergency stops on their way to agents |
+//! | [`relay`] | messages of frameworks on their way to executors |
 //! | `strays` | what an agent runs and should not |
+//! | `execs` | programs that clients run in tasks: a stream of its own for each |
 //! | [`logs`] | logs, asked of the agent that has them |
 
 pub mod agents;
 pub mod board;
+pub(crate) mod execs;
 pub mod frameworks;
 pub mod logs;
 pub mod nodes;
+pub mod orders;
 pub mod poses;
+pub mod relay;
 pub mod reports;
 mod strays;
 
@@ -39,6 +45,7 @@ use tokio::sync::{Notify, RwLock, RwLockReadGuard, RwLockWriteGuard, mpsc, watch
 use tokio::time::Instant;
 
 use board::Board;
+use orders::Orders;
 
 /// The generated server side of the session.
 #[allow(clippy::all, clippy::allow_attributes, unreachable_pub, reason = "generated")]
@@ -65,12 +72,16 @@ pub(crate) struct Connection {
     pub(crate) id: u64,
     /// Messages to the agent, beside its assignments.
     pub(crate) outbound: mpsc::Sender<wire::ControllerMessage>,
+    /// Messages of frameworks to its executors.
+    pub(crate) relay: relay::Relay,
     /// Who may exchange messages with its executors directly.
     pub(crate) tickets: watch::Sender<wire::Tickets>,
     /// Logs being read.
     pub(crate) logs: Arc<logs::Readers>,
     /// Ends this session: a later one of the same node has begun.
     pub(crate) replaced: tokio_util::sync::CancellationToken,
+    /// This session has ended.
+    pub(crate) ended: tokio_util::sync::CancellationToken,
     /// What it said first is in the store.
     pub(crate) written: Arc<AtomicBool>,
 }
@@ -79,6 +90,7 @@ pub(crate) struct Connection {
 #[derive(Debug)]
 pub struct Sessions {
     board: Board,
+    orders: Orders,
     connections: Mutex<HashMap<NodeName, Connection>>,
     /// Read: a session begins. Written: a person decides over a node that must not begin one meanwhile.
     /// Held over writes to the store only, never while an agent is waited for.
@@ -93,6 +105,7 @@ impl Default for Sessions {
     fn default() -> Self {
         Sessions {
             board: Board::default(),
+            orders: Orders::default(),
             connections: Mutex::default(),
             beginnings: RwLock::default(),
             health: Mutex::new(NodeHealth::new(DETECT_AFTER)),
@@ -113,6 +126,11 @@ impl Sessions {
     #[must_use]
     pub fn board(&self) -> &Board {
         &self.board
+    }
+
+    /// What agents are told of emergency stops.
+    pub(crate) fn orders(&self) -> &Orders {
+        &self.orders
     }
 
     fn now(&self) -> Monotonic {
@@ -180,12 +198,12 @@ impl Sessions {
         self.beginnings.write().await
     }
 
-    /// Takes a session in; an earlier one of the same node ends.
     /// Whether what the agent said first in its present session is in the store.
     pub(crate) fn is_known(&self, node: &NodeName) -> bool {
         self.connection(node).is_some_and(|connection| connection.written.load(Ordering::Acquire))
     }
 
+    /// Takes a session in; an earlier one of the same node ends.
     pub(crate) fn connect(&self, node: &NodeName, connection: Connection) {
         if let Some(earlier) = lock(&self.connections).insert(node.clone(), connection) {
             earlier.replaced.cancel();

@@ -16,6 +16,7 @@ use muster_api::wire::agent_session::NodeReport;
 
 use crate::context::Context;
 use crate::objects;
+use crate::reconcile::images;
 use crate::rest::enrol;
 use crate::store::{Op, StoreError, Stored};
 
@@ -48,16 +49,17 @@ pub(crate) enum NodeError {
     Store(#[from] StoreError),
 }
 
-/// The Node for which an agent may speak.
+/// The Node for which the agent with this key may speak.
 pub(crate) fn admit(
     context: &Context,
-    speaker: &Speaker,
+    name: &NodeName,
+    key: &str,
 ) -> Result<(Arc<Stored>, Node), NodeError> {
-    let stored = context.store.get(&objects::node_key(speaker.node.as_str()));
+    let stored = context.store.get(&objects::node_key(name.as_str()));
     let node = stored.and_then(|s| objects::read::<Node>(&s).map(|node| (s, node)));
-    let (stored, node) = node.ok_or_else(|| NodeError::Deleted { node: speaker.node.clone() })?;
-    if !enrol::is_agent_of(&node, &speaker.key) {
-        return Err(NodeError::OtherAgent { node: speaker.node.clone() });
+    let (stored, node) = node.ok_or_else(|| NodeError::Deleted { node: name.clone() })?;
+    if !enrol::is_agent_of(&node, key) {
+        return Err(NodeError::OtherAgent { node: name.clone() });
     }
     Ok((stored, node))
 }
@@ -71,7 +73,7 @@ pub(crate) async fn write(
     strays: &[String],
 ) -> Result<Box<str>, NodeError> {
     loop {
-        let (stored, mut node) = admit(context, speaker)?;
+        let (stored, mut node) = admit(context, &speaker.node, &speaker.key)?;
         if node.spec.kind != report.kind {
             return Err(NodeError::KindChanged {
                 node: speaker.node.clone(),
@@ -88,7 +90,10 @@ pub(crate) async fn write(
         }
         ops.extend(free_lease(context, speaker, report));
         match context.store.apply(ops).await {
-            Ok(_) => return Ok(stored.uid.clone()),
+            Ok(_) => {
+                images::tell(context, &before, &node);
+                return Ok(stored.uid.clone());
+            }
             Err(error) if objects::is_race(&error) => tokio::task::yield_now().await,
             Err(error) => return Err(error.into()),
         }
@@ -142,6 +147,7 @@ fn fill(context: &Context, speaker: &Speaker, report: &NodeReport, node: &mut No
     status.battery = report.battery;
     status.mission_locks.clone_from(&report.mission_locks);
     status.estop.clone_from(&report.estop);
+    status.images.clone_from(&report.images);
     if let Some(pose) = &report.pose
         && status
             .pose

@@ -1,10 +1,13 @@
 //! Where a batch becomes durable: the only part of the store that differs between SQLite and memory.
 
+use std::fmt;
+
 use futures::future::BoxFuture;
 
 use super::Event;
 
-/// One row of history as it was committed.
+/// One row of history as it was committed. What is in it is not shown in logs.
+#[derive(Clone)]
 pub(super) struct Row {
     pub(super) revision: u64,
     pub(super) resource: String,
@@ -13,6 +16,13 @@ pub(super) struct Row {
     pub(super) uid: String,
     pub(super) deleted: bool,
     pub(super) value: String,
+}
+
+impl fmt::Debug for Row {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Row { revision, resource, namespace, name, .. } = self;
+        write!(f, "Row({revision}, {resource}/{namespace}/{name})")
+    }
 }
 
 /// What one commit writes. All of it or nothing.

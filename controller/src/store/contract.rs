@@ -131,6 +131,33 @@ async fn transactions_are_whole(store: &Store) {
     store.delete(task("t1"), Precondition::Any).await.unwrap();
 }
 
+async fn a_look_holds_until_something_of_it_is_written(store: &Store) {
+    let still = |revision| Op::Still { revision, of: &[TASKS] };
+    let looked = store.revision();
+    store.create(Key::cluster(NODES, "beside"), json!({"metadata": {}})).await.unwrap();
+    let mine = |name: &str| Op::create(task(name), body(name, 0));
+    let done = store.apply(vec![still(looked), mine("still-1"), mine("still-2")]).await.unwrap();
+    assert_eq!(done.len(), 2, "what it writes itself is nothing against it");
+    let moved = store.apply(vec![still(looked), mine("still-3")]).await.unwrap_err();
+    let is_it = |key: &Option<Key>| *key == Some(task("still-1"));
+    assert!(matches!(&moved, StoreError::Moved { key, .. } if is_it(key)), "{moved:?}");
+    assert!(store.get(&task("still-3")).is_none());
+    let ahead = store.apply(vec![still(store.revision() + 1), mine("still-3")]).await;
+    assert!(matches!(ahead, Err(StoreError::Moved { key: None, .. })), "{ahead:?}");
+    // Of all that look at the same time one writes, whether they are in one batch or not.
+    let looked = store.revision();
+    let mut all = JoinSet::new();
+    for n in 0..32 {
+        let (store, key) = (store.clone(), task(&format!("race-{n}")));
+        all.spawn(async move {
+            let ops =
+                vec![Op::Still { revision: looked, of: &[TASKS] }, Op::create(key, body("x", n))];
+            store.apply(ops).await.is_ok()
+        });
+    }
+    assert_eq!(all.join_all().await.into_iter().filter(|won| *won).count(), 1);
+}
+
 async fn lists_are_ordered_and_exact(store: &Store) {
     for name in ["l3", "l1", "l2"] {
         create(store, name).await;
@@ -259,6 +286,7 @@ async fn suite(running: Running) {
     updates_do_not_lose_each_other(store).await;
     compaction_expires_watches(store).await;
     malformed_values_are_refused(store).await;
+    a_look_holds_until_something_of_it_is_written(store).await;
     let mut last = store.watch(TASKS, store.revision()).unwrap();
     let store = store.clone();
     running.shut_down().await;
@@ -307,6 +335,8 @@ async fn a_commit_that_only_seemed_to_fail_is_published_late() {
     let unsure = store.create(task("a"), body("a", 0)).await;
     assert!(matches!(unsure, Err(StoreError::Storage { .. })), "{unsure:?}");
     assert_eq!(store.get(&task("a")), None, "not before the disk was asked");
+    store.settled().await.unwrap();
+    assert!(store.get(&task("a")).is_some(), "the disk was asked");
     let again = store.create(task("a"), body("a", 0)).await;
     assert!(matches!(again, Err(StoreError::AlreadyExists { .. })), "{again:?}");
     assert_eq!(create(&store, "b").await.revision, 2);

@@ -31,6 +31,14 @@ pub enum StoreError {
         /// What it is.
         actual: u64,
     },
+    /// Something was written since the caller looked.
+    #[error("{} after revision {since}", changed(key.as_ref()))]
+    Moved {
+        /// When the caller looked.
+        since: u64,
+        /// What was written first; none: history does not reach back so far.
+        key: Option<Key>,
+    },
     /// Another object has this name now.
     #[error("{key} has uid {actual:?}, not {expected:?}")]
     UidMismatch {
@@ -41,7 +49,7 @@ pub enum StoreError {
         /// The one that is there.
         actual: String,
     },
-    /// The value is not an object with an object in `metadata`.
+    /// The value is not an object with an object in `metadata`, or it is too deep or too large.
     #[error("{key} cannot be stored: {reason}")]
     Malformed {
         /// The object.
@@ -60,6 +68,10 @@ pub enum StoreError {
         #[source]
         source: Arc<BackendError>,
     },
+}
+
+fn changed(key: Option<&Key>) -> String {
+    key.map_or_else(|| "much has changed".to_owned(), |key| format!("{key} has changed"))
 }
 
 /// Why [`Store::update`](super::Store::update) gave up.

@@ -95,7 +95,7 @@ impl Store {
         !self.requests.is_closed()
     }
 
-    /// Applies a transaction. Returns the new states in order, none for an [`Op::Check`]; for a removal the last
+    /// Applies a transaction. Returns the new states in order, none for an [`Op::Check`] or [`Op::Still`]; for a removal the last
     /// state with the removal's revision.
     ///
     /// # Errors
@@ -117,7 +117,7 @@ impl Store {
     /// As [`Store::apply`].
     ///
     /// # Panics
-    /// When `op` is an [`Op::Check`], which changes nothing.
+    /// When `op` is an [`Op::Check`] or [`Op::Still`], which change nothing.
     pub async fn apply_one(&self, op: Op) -> Result<Arc<Stored>, StoreError> {
         let mut stored = self.apply(vec![op]).await?;
         Ok(stored.pop().expect("one change has one result"))
@@ -181,6 +181,18 @@ impl Store {
         }
     }
 
+    /// Ready when it is known of every transaction that was answered before whether the disk has it. What seemed to fail
+    /// and is there all the same can be read from then on.
+    ///
+    /// # Errors
+    /// While the disk cannot be asked.
+    pub async fn settled(&self) -> Result<(), StoreError> {
+        let (answer, answered) = oneshot::channel();
+        let sent = self.requests.send(Request::Settle { answer }).await;
+        sent.map_err(|_| StoreError::Closed)?;
+        answered.await.map_err(|_| StoreError::Closed)?
+    }
+
     /// Forgets history through `revision`. Watches from before it get [`WatchEnd::Expired`](super::WatchEnd).
     ///
     /// # Errors
@@ -199,12 +211,15 @@ fn prepare(op: Op) -> Result<Prepared, StoreError> {
             Ok(template) => Ok(Prepared::Put { key, template, precondition }),
             Err(reason) => Err(StoreError::Malformed { key, reason }),
         },
-        Op::Status { of, status } => Ok(Prepared::Put {
-            key: of.key.clone(),
-            template: Template::with_status(&of, &status),
-            precondition: Precondition::revision(of.revision),
-        }),
+        Op::Status { of, status } => match Template::with_status(&of, &status) {
+            Ok(template) => {
+                let precondition = Precondition::revision(of.revision);
+                Ok(Prepared::Put { key: of.key.clone(), template, precondition })
+            }
+            Err(reason) => Err(StoreError::Malformed { key: of.key.clone(), reason }),
+        },
         Op::Delete { key, precondition } => Ok(Prepared::Delete { key, precondition }),
         Op::Check { key, precondition } => Ok(Prepared::Check { key, precondition }),
+        Op::Still { revision, of } => Ok(Prepared::Still { revision, of }),
     }
 }

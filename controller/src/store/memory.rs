@@ -1,7 +1,12 @@
-//! The double: the same front over nothing durable, for tests of everything above the store.
+//! The double: the same front over memory, for tests of everything above the store.
+//!
+//! A [`Disk`] outlives the stores that are opened on it, as a file outlives its controller. A batch is on it whole or not
+//! at all, some time before it is answered: whoever is killed in between does not know which.
 
-use std::sync::Arc;
+use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicU32, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
 
 use futures::FutureExt as _;
 use futures::future::BoxFuture;
@@ -9,7 +14,7 @@ use tokio_util::sync::CancellationToken;
 
 use super::backend::{Backend, BackendError, Batch, Row};
 use super::state::RingLimits;
-use super::{Store, Writer, writer};
+use super::{Change, Event, Store, Writer, writer};
 
 /// Makes coming commits fail.
 #[derive(Debug, Clone, Default)]
@@ -30,18 +35,106 @@ impl Failures {
     }
 }
 
-#[derive(Debug, Default)]
-struct Memory {
-    last: u64,
+/// What is kept when the store is gone.
+#[derive(Debug, Clone, Default)]
+pub struct Disk {
+    kept: Arc<Mutex<Kept>>,
     failures: Failures,
 }
 
-impl Backend for Memory {
+#[derive(Debug, Default)]
+struct Kept {
+    rows: BTreeMap<u64, Row>,
+    compacted: u64,
+    last: u64,
+    /// How long a commit takes until it is on the disk, and from then until it is answered.
+    latency: (Duration, Duration),
+    /// Only every so many commits is synced.
+    synced_every: u64,
+    commits: u64,
+    synced: u64,
+}
+
+impl Disk {
+    /// How its commits fail.
+    #[must_use]
+    pub fn failures(&self) -> &Failures {
+        &self.failures
+    }
+
+    /// From now on a commit takes so long until it is on the disk, and so much longer until it is answered.
+    pub fn set_latency(&self, until_kept: Duration, until_answered: Duration) {
+        self.kept().latency = (until_kept, until_answered);
+    }
+
+    /// Plants a fault, to see that somebody finds it: only every so many commits is synced, and what came after that is gone
+    /// for the next who opens it.
+    pub fn sync_every(&self, commits: u64) {
+        self.kept().synced_every = commits;
+    }
+
+    /// The store as it is on the disk, and its writer to run. One at a time: who opens a second one has killed the first.
+    ///
+    /// # Panics
+    /// When the rows contradict each other, which no batch that was kept whole brings about.
+    pub async fn open(&self) -> (Store, Writer) {
+        self.kept().lose_unsynced();
+        writer::open(Box::new(self.clone()), RingLimits::DEFAULT)
+            .await
+            .expect("a disk in memory loads what was committed to it")
+    }
+
+    fn kept(&self) -> MutexGuard<'_, Kept> {
+        self.kept.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl Kept {
+    fn lose_unsynced(&mut self) {
+        self.rows.split_off(&(self.synced + 1));
+        self.last = self.synced;
+    }
+
+    fn take(&mut self, batch: &Batch<'_>) {
+        for event in batch.events {
+            self.last = event.revision();
+            self.rows.insert(event.revision(), row(event));
+        }
+        self.commits += 1;
+        if self.synced_every < 2 || self.commits.is_multiple_of(self.synced_every) {
+            self.synced = self.last;
+        }
+        if let Some(compaction) = batch.compaction {
+            self.compacted = compaction.through;
+            for revision in &compaction.garbage {
+                self.rows.remove(revision);
+            }
+        }
+    }
+}
+
+fn row(event: &Event) -> Row {
+    let key = &event.object.key;
+    Row {
+        revision: event.revision(),
+        resource: key.resource.as_str().to_owned(),
+        namespace: key.namespace().unwrap_or_default().to_owned(),
+        name: key.name.to_string(),
+        uid: event.object.uid.to_string(),
+        deleted: event.change == Change::Delete,
+        value: String::from_utf8_lossy(&event.object.bytes).into_owned(),
+    }
+}
+
+impl Backend for Disk {
     fn load<'a>(
         &'a mut self,
-        _sink: &'a mut (dyn FnMut(Row) + Send),
+        sink: &'a mut (dyn FnMut(Row) + Send),
     ) -> BoxFuture<'a, Result<u64, BackendError>> {
-        async { Ok(0) }.boxed()
+        let kept = self.kept();
+        kept.rows.values().cloned().for_each(sink);
+        let compacted = kept.compacted;
+        async move { Ok(compacted) }.boxed()
     }
 
     fn commit<'a>(&'a mut self, batch: Batch<'a>) -> BoxFuture<'a, Result<(), BackendError>> {
@@ -49,27 +142,36 @@ impl Backend for Memory {
             left.fetch_update(Ordering::SeqCst, Ordering::SeqCst, |left| left.checked_sub(1))
         };
         let lost = take(&self.failures.lost).is_ok();
-        if !lost {
-            self.last = batch.events.last().map_or(self.last, super::Event::revision);
-        }
         let failed = lost || take(&self.failures.unheard).is_ok();
-        let result = if failed { Err(BackendError::Injected) } else { Ok(()) };
-        async { result }.boxed()
+        let (until_kept, until_answered) = self.kept().latency;
+        async move {
+            pass(until_kept).await;
+            if !lost {
+                self.kept().take(&batch);
+            }
+            pass(until_answered).await;
+            if failed { Err(BackendError::Injected) } else { Ok(()) }
+        }
+        .boxed()
     }
 
     fn last_revision(&mut self) -> BoxFuture<'_, Result<u64, BackendError>> {
-        async { Ok(self.last) }.boxed()
+        let last = self.kept().last;
+        async move { Ok(last) }.boxed()
+    }
+}
+
+async fn pass(time: Duration) {
+    if !time.is_zero() {
+        tokio::time::sleep(time).await;
     }
 }
 
 /// An empty store in memory, and its writer to run.
 pub async fn open() -> (Store, Writer, Failures) {
-    let failures = Failures::default();
-    let backend = Memory { last: 0, failures: failures.clone() };
-    let (store, writer) = writer::open(Box::new(backend), RingLimits::DEFAULT)
-        .await
-        .expect("an empty store loads nothing");
-    (store, writer, failures)
+    let disk = Disk::default();
+    let (store, writer) = disk.open().await;
+    (store, writer, disk.failures)
 }
 
 /// An empty store in memory whose writer already runs; it ends with the last handle. For tests.

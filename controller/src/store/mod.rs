@@ -51,6 +51,7 @@ use serde_json::Value;
 use serde_json::value::RawValue;
 
 pub use backend::BackendError;
+pub use document::{DEEPEST, LARGEST, is_deeper};
 pub use error::{OpenError, StoreError, UpdateError};
 pub use handle::Store;
 pub use key::{Key, Resource};
@@ -71,7 +72,16 @@ pub struct Stored {
     pub bytes: Bytes,
     /// Its labels, read once: a thousand watchers may each ask for them.
     labels: OnceLock<Box<Labels>>,
+    /// The same with what a view of it adds.
+    shown: OnceLock<Box<Labels>>,
+    /// The fields that it can be selected by, read once for each way in which it is shown.
+    fields: OnceLock<Box<[OnceLock<Fields>; SHOWN]>>,
 }
+
+/// Values of fields, in an order that their reader knows.
+type Fields = Box<[Box<str>]>;
+/// In how many ways an object is shown: as it is, and as another kind.
+pub const SHOWN: usize = 2;
 
 impl fmt::Debug for Stored {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -99,7 +109,16 @@ impl Stored {
     /// An object at a revision.
     #[must_use]
     pub fn new(key: Key, revision: u64, uid: Box<str>, bytes: Bytes) -> Self {
-        Self { key, revision, uid, bytes, labels: OnceLock::new() }
+        let (labels, shown, fields) = (OnceLock::new(), OnceLock::new(), OnceLock::new());
+        Self { key, revision, uid, bytes, labels, shown, fields }
+    }
+
+    /// The same object as if it had been written at `revision`: the last that somebody sees of it who does not see what it
+    /// became.
+    #[must_use]
+    pub fn at(&self, revision: u64) -> Self {
+        let bytes = document::Template::again(self).at(revision);
+        Self::new(self.key.clone(), revision, self.uid.clone(), bytes)
     }
 
     /// Its labels.
@@ -109,6 +128,22 @@ impl Stored {
             let labels = self.parse::<Labelled>().ok().and_then(|object| object.metadata.labels);
             Box::new(labels.unwrap_or_default())
         })
+    }
+
+    /// Its labels with what its view adds, which `add` says the first time.
+    #[must_use]
+    pub fn labels_shown(&self, add: impl FnOnce(&Labels) -> Labels) -> &Labels {
+        self.shown.get_or_init(|| Box::new(add(self.labels())))
+    }
+
+    /// What `read` finds in it the first time it is asked for as it is shown in the way `shown`, one of [`SHOWN`].
+    ///
+    /// # Panics
+    /// When there is no such way.
+    #[must_use]
+    pub fn fields(&self, shown: usize, read: impl FnOnce() -> Vec<String>) -> &[Box<str>] {
+        let all = self.fields.get_or_init(Box::default);
+        all[shown].get_or_init(|| read().into_iter().map(String::into_boxed_str).collect())
     }
 
     /// Whether a field of this name can be in the object. A cheap look at the text, so that most objects
@@ -129,7 +164,7 @@ impl Stored {
     /// The object as a JSON tree.
     ///
     /// # Panics
-    /// Never for an object of a store: only JSON that serde_json produced is stored.
+    /// Never for an object of a store: only JSON that serde_json produced, and no deeper than it reads, is stored.
     #[must_use]
     pub fn value(&self) -> Value {
         serde_json::from_slice(&self.bytes).expect("stored bytes were rendered from JSON")
@@ -205,6 +240,14 @@ pub enum Op {
         /// What must hold.
         precondition: Precondition,
     },
+    /// Change nothing, but let the transaction pass only while no object of these resources was written after a revision.
+    /// Only what the transaction itself did before this counts as well.
+    Still {
+        /// Everything up to it is known.
+        revision: u64,
+        /// Of which resources.
+        of: &'static [Resource],
+    },
     /// Remove an object.
     Delete {
         /// Where the object lives.
@@ -221,6 +264,9 @@ impl fmt::Debug for Op {
             Op::Status { of, .. } => ("Status", &of.key),
             Op::Check { key, .. } => ("Check", key),
             Op::Delete { key, .. } => ("Delete", key),
+            Op::Still { revision, .. } => {
+                return f.debug_tuple("Still").field(revision).finish();
+            }
         };
         f.debug_tuple(what).field(key).finish()
     }

@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use super::document::Template;
 use super::state::State;
-use super::{Change, Event, Key, Precondition, StoreError, Stored};
+use super::{Change, Event, Key, Precondition, Resource, StoreError, Stored};
 
 /// An operation rendered by its caller.
 #[derive(Debug)]
@@ -13,6 +13,7 @@ pub(super) enum Prepared {
     Put { key: Key, template: Template, precondition: Precondition },
     Delete { key: Key, precondition: Precondition },
     Check { key: Key, precondition: Precondition },
+    Still { revision: u64, of: &'static [Resource] },
 }
 
 /// What the batch will leave behind, over the committed state.
@@ -79,8 +80,7 @@ impl Pending {
                 let Some(last) = present.map(Arc::clone) else {
                     return Err(StoreError::NotFound { key });
                 };
-                let template = Template::new(&last.value())
-                    .map_err(|reason| StoreError::Malformed { key, reason })?;
+                let template = Template::again(&last);
                 let bytes = template.at(revision);
                 let object = Arc::new(Stored::new(last.key.clone(), revision, template.uid, bytes));
                 Ok(Some(Event { change: Change::Delete, object, previous: Some(last) }))
@@ -89,6 +89,18 @@ impl Pending {
                 check(&key, &precondition, self.present(committed, &key))?;
                 Ok(None)
             }
+            Prepared::Still { revision, of } => self.still(committed, revision, of).map(|()| None),
+        }
+    }
+
+    /// Whether nothing of these resources was, or is about to be, written after a revision.
+    fn still(&self, committed: &State, since: u64, of: &[Resource]) -> Result<(), StoreError> {
+        let known = committed.since(since).ok().filter(|_| since <= committed.revision());
+        let known = known.ok_or(StoreError::Moved { since, key: None })?;
+        let mut keys = known.chain(&self.events).map(|event| &event.object.key);
+        match keys.find(|key| of.contains(&key.resource)) {
+            Some(key) => Err(StoreError::Moved { since, key: Some(key.clone()) }),
+            None => Ok(()),
         }
     }
 

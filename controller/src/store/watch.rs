@@ -70,6 +70,12 @@ impl Watcher {
         self.cursor
     }
 
+    /// Goes back to `revision`: what came after it was handed out and not used, and is handed out again. Who cannot send
+    /// what there is holds nothing of it meanwhile, and has fallen behind when it is gone.
+    pub fn rewind(&mut self, revision: u64) {
+        self.cursor = self.cursor.min(revision);
+    }
+
     /// Waits for the next changes, in revision order; never empty. Cancel safe: what was not returned will be.
     ///
     /// # Errors

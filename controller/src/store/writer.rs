@@ -30,6 +30,7 @@ pub(super) type Answer = Result<Vec<Arc<Stored>>, StoreError>;
 pub(super) enum Request {
     Apply { ops: Vec<Prepared>, answer: oneshot::Sender<Answer> },
     Compact { through: u64, answer: oneshot::Sender<Result<(), StoreError>> },
+    Settle { answer: oneshot::Sender<Result<(), StoreError>> },
 }
 
 /// The task behind a [`Store`]; nothing is written unless somebody runs it.
@@ -136,6 +137,8 @@ impl Writer {
                 self.state.write().unwrap_or_else(PoisonError::into_inner).compact(through);
                 round.compacting.push(answer);
             }
+            // Before this round began, everything before it was.
+            Request::Settle { answer } => drop(answer.send(Ok(()))),
         }
     }
 
@@ -219,6 +222,8 @@ impl Writer {
 fn refuse(request: Request, error: StoreError) {
     match request {
         Request::Apply { answer, .. } => drop(answer.send(Err(error))),
-        Request::Compact { answer, .. } => drop(answer.send(Err(error))),
+        Request::Compact { answer, .. } | Request::Settle { answer } => {
+            drop(answer.send(Err(error)));
+        }
     }
 }

@@ -135,6 +135,21 @@ async fn a_fence_needs_a_reason_and_an_admin() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_robot_that_a_person_has_stopped_is_not_deleted() {
+    let cluster = Cluster::start().await;
+    let admin = cluster.admin().await;
+    join(&cluster, "r1").await;
+    let estop = |tier: Value| json!({"spec": {"estop": tier}});
+    assert_eq!(send(&admin, "PATCH", NODE, estop(json!("Cut"))).await.0, 200);
+    let refused = send(&admin, "DELETE", NODE, Value::Null).await;
+    assert_eq!(refusal(&refused), (409, "NodeStopped"));
+    assert!(refused.1["message"].as_str().unwrap().contains("muster estop r1 --release"));
+    assert_eq!(send(&admin, "PATCH", NODE, estop(Value::Null)).await.0, 200);
+    assert_eq!(send(&admin, "DELETE", NODE, Value::Null).await.0, 200);
+    cluster.running.shut_down().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_node_in_use_is_not_deleted_and_a_deleted_one_takes_its_credential_along() {
     let cluster = Cluster::start().await;
     let admin = cluster.admin().await;

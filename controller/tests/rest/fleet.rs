@@ -12,7 +12,8 @@ use super::support::*;
 
 const ROBOTS: usize = 30;
 const SETS: &str = "/apis/muster.dev/v1alpha1/namespaces/default/tasksets";
-/// The robot on which the program `fragile` crashes; its name is the first, so a canary is tried on it.
+/// The robot on which the program `fragile` crashes and the readiness probe of `deaf` fails; its name is the first, so a
+/// canary is tried on it.
 const WEAK: &str = "robot-00";
 
 /// A robot that says of each of its tasks that it runs, until it is to end.
@@ -29,10 +30,17 @@ fn robot(cluster_session: Session, name: String) -> JoinHandle<()> {
                     continue;
                 }
                 let spec: Value = serde_json::from_slice(&assignment.spec).unwrap();
-                let fragile = spec["run"]["process"]["command"] == json!(["fragile"]);
+                let runs = |program: &str| {
+                    spec["run"]["process"]["command"] == json!([program]) && name == WEAK
+                };
                 let next = if ending { 10 } else { 1 };
                 *sequence = next;
-                session.say(state(&assignment.uid, next, ending, fragile && name == WEAK)).await;
+                let mut said = state(&assignment.uid, next, ending, runs("fragile"));
+                if runs("deaf") && !ending {
+                    said.ready = Some(false);
+                    said.message = "its readiness probe failed: HTTP status 503".to_owned();
+                }
+                session.say(said).await;
             }
         }
     })
@@ -107,6 +115,13 @@ async fn command(client: &kube::Client, command: &str) {
     assert_eq!(code, 200, "{answer}");
 }
 
+/// How long a changed task gets.
+async fn deadline(client: &kube::Client, seconds: u32) {
+    let patch = json!({"spec": {"rollout": {"progressDeadlineSeconds": seconds}}});
+    let (code, answer) = send(client, "PATCH", &format!("{SETS}/patrol"), patch).await;
+    assert_eq!(code, 200, "{answer}");
+}
+
 async fn lock(client: &kube::Client, node: &str, lock: Value) {
     let patch = json!({"metadata": {"annotations": {"muster.dev/mission-lock": lock}}});
     let (code, answer) = send(client, "PATCH", &format!("{G}/nodes/{node}"), patch).await;
@@ -129,13 +144,49 @@ async fn thirty_robots_are_changed_one_fails_and_one_is_on_a_mission() {
     let why = &given_up["status"]["rolledBackFrom"];
     assert_eq!(why["reason"], "Crashed", "{why}");
     assert!(why["message"].as_str().unwrap().contains("exited with code 3"), "{why}");
-    let after = tasks(&admin).await;
+    let mut after = tasks(&admin).await;
     let touched: BTreeSet<&String> =
         after.iter().filter(|(node, task)| before[*node] != **task).map(|(node, _)| node).collect();
     assert_eq!(touched, BTreeSet::from([&WEAK.to_owned()]), "the others are untouched");
     assert!(after.values().all(|(_, command)| command == "steady"), "{after:?}");
 
+    deadline(&admin, 6).await;
+    command(&admin, "deaf").await;
+    let given_up = rollout(&cluster, "RolledBack", 0).await;
+    let why = &given_up["status"]["rolledBackFrom"];
+    assert_eq!(why["reason"], "ProbeFailed", "{why}");
+    assert!(why["message"].as_str().unwrap().ends_with("HTTP status 503"), "{why}");
+    deadline(&admin, 600).await;
+    let before = std::mem::replace(&mut after, tasks(&admin).await);
+    let others = |all: &BTreeMap<String, (String, Value)>| {
+        all.iter()
+            .filter(|(node, _)| *node != WEAK)
+            .map(|(_, task)| task.clone())
+            .collect::<Vec<_>>()
+    };
+    assert_eq!(others(&before), others(&after), "the others are untouched");
+
     lock(&admin, "robot-07", json!("ada: carries a tray")).await;
+    let plan = async |object: Value| {
+        let objects = json!({ "objects": [object] });
+        let (code, plan) = send(&admin, "POST", &format!("{G}/plan"), objects).await;
+        assert_eq!(code, 200, "{plan}");
+        plan
+    };
+    let planned = plan(set("better")).await;
+    let of_set = &planned["sets"][0];
+    let many = |field: &str| of_set[field].as_array().unwrap().len();
+    assert_eq!((many("begins"), many("changes"), many("ends")), (0, ROBOTS - 1, 0), "{planned}");
+    assert_eq!(of_set["held"][0]["node"], "robot-07", "{planned}");
+    let mut other = set("steady");
+    other["metadata"]["name"] = "other".into();
+    let planned = plan(other).await;
+    let begins = planned["sets"][0]["begins"].as_array().unwrap();
+    let placed = planned["placements"].as_array().unwrap();
+    assert_eq!((begins.len(), placed.len()), (ROBOTS, ROBOTS), "{planned}");
+    let first = placed.iter().find(|p| p["name"] == "other-robot-00").unwrap();
+    assert_eq!(first["node"], "robot-00", "{planned}");
+
     command(&admin, "better").await;
     let held = rollout(&cluster, "MissionLock", ROBOTS - 1).await;
     assert_eq!(

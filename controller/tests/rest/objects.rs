@@ -122,6 +122,12 @@ async fn what_the_server_owns_is_not_taken_from_clients() {
     assert_eq!(code, 201);
     assert!(generated["metadata"]["name"].as_str().unwrap().starts_with("run-"));
 
+    // Who names it means this one.
+    let mut named = task("own");
+    named["metadata"]["generateName"] = "own-".into();
+    let twice = send(&admin, "POST", TASKS, named).await;
+    assert_eq!(refusal(&twice), (409, "AlreadyExists"));
+
     let (code, _) = send(&admin, "POST", &format!("{TASKS}?dryRun=All"), task("dry")).await;
     assert_eq!(code, 201);
     assert_eq!(get(&admin, &format!("{TASKS}/dry")).await.0, 404);
@@ -174,6 +180,19 @@ async fn lists_select_and_come_in_exact_pages() {
     assert_eq!(names(&rest), ["c", "d", "e"], "as it was when the list began");
     assert_eq!(rest["metadata"]["resourceVersion"], page["metadata"]["resourceVersion"]);
 
+    // The history is forgotten: the rest can be had as it is now, by those who say that they know.
+    let store = &cluster.running.context().store;
+    store.compact(store.revision()).await.unwrap();
+    let late = get(&admin, &format!("{EVENTS}?limit=10&continue={token}")).await;
+    assert_eq!(refusal(&late), (410, "Expired"));
+    let token = late.1["metadata"]["continue"].as_str().unwrap();
+    let (_, rest) = get(&admin, &format!("{EVENTS}?limit=2&continue={token}")).await;
+    assert_eq!(names(&rest), ["d", "e"], "c is gone");
+    let token = rest["metadata"]["continue"].as_str().unwrap();
+    let (_, rest) = get(&admin, &format!("{EVENTS}?continue={token}")).await;
+    assert_eq!(names(&rest), ["f"]);
+    assert_eq!(rest["metadata"]["continue"], Value::Null);
+
     let select = |query: &str| {
         let (admin, path) = (admin.clone(), format!("{EVENTS}?{query}"));
         async move { get(&admin, &path).await }
@@ -187,6 +206,83 @@ async fn lists_select_and_come_in_exact_pages() {
     assert_eq!(refusal(&unknown), (400, "BadRequest"));
     assert_eq!(refusal(&select("continue=nonsense").await), (400, "BadRequest"));
     assert_eq!(refusal(&select("resourceVersion=99999").await), (504, "Timeout"));
+    // A page of a revision, as Kubernetes means it, is of that one; and it goes on by its token alone.
+    let (_, made) = send(&admin, "POST", EVENTS, event("g")).await;
+    let then = made["metadata"]["resourceVersion"].as_str().unwrap();
+    send(&admin, "POST", EVENTS, event("h")).await;
+    let page = select(&format!("limit=10&resourceVersion={then}")).await.1;
+    assert_eq!(names(&page), ["a", "b", "d", "e", "f", "g"]);
+    assert_eq!(page["metadata"]["resourceVersion"], then);
+    let page = select("limit=1").await.1;
+    let token = page["metadata"]["continue"].as_str().unwrap();
+    let mixed = select(&format!("resourceVersion={then}&continue={token}")).await;
+    assert_eq!(refusal(&mixed), (400, "BadRequest"));
+    assert_eq!(select(&format!("resourceVersion=0&continue={token}")).await.0, 200);
+    use base64::Engine as _;
+    let ahead = r#"{"revision":99999,"namespace":"default","name":"a"}"#;
+    let ahead = base64::engine::general_purpose::URL_SAFE_NO_PAD.encode(ahead);
+    assert_eq!(refusal(&select(&format!("continue={ahead}")).await), (504, "Timeout"));
+    assert!(names(&select("fieldSelector=metadata.namespace=other").await.1).is_empty());
+    assert_eq!(names(&select("fieldSelector=metadata.namespace=default&limit=1").await.1), ["a"]);
+    cluster.running.shut_down().await.unwrap();
+}
+
+/// An answer as a table, of a list or of one.
+async fn table(client: &kube::Client, path: &str) -> Value {
+    let accept = "application/json;as=Table;v=v1;g=meta.k8s.io,application/json";
+    let request = http::Request::get(path).header("accept", accept).body(Vec::new()).unwrap();
+    let text = client.request_text(request).await.unwrap();
+    serde_json::from_str(&text).unwrap()
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_table_has_what_kubectl_prints() {
+    let cluster = Cluster::start().await;
+    let admin = cluster.admin().await;
+    send(&admin, "POST", TASKS, task("t")).await;
+    let list = table(&admin, TASKS).await;
+    assert_eq!((&list["kind"], &list["apiVersion"]), (&json!("Table"), &json!("meta.k8s.io/v1")));
+    assert!(list["metadata"]["resourceVersion"].is_string());
+    let columns = list["columnDefinitions"].as_array().unwrap();
+    let of = |priority: i64| -> Vec<&str> {
+        let shown = columns.iter().filter(|column| column["priority"] == priority);
+        shown.map(|column| column["name"].as_str().unwrap()).collect()
+    };
+    assert_eq!((of(0)[0], columns[0]["format"].as_str()), ("Name", Some("name")));
+    assert!(of(0).iter().any(|name| name.eq_ignore_ascii_case("age")), "{columns:?}");
+    assert!(
+        of(1).iter().any(|name| name.eq_ignore_ascii_case("message")),
+        "for -o wide: {columns:?}"
+    );
+    let row = &list["rows"][0];
+    assert_eq!(
+        (&row["cells"][0], row["cells"].as_array().unwrap().len()),
+        (&json!("t"), columns.len())
+    );
+    assert_eq!(row["object"]["kind"], "PartialObjectMetadata");
+    assert_eq!(row["object"]["metadata"]["labels"]["app"], "t");
+    let included = async |how: &str| table(&admin, &format!("{TASKS}?includeObject={how}")).await;
+    assert_eq!(included("None").await["rows"][0]["object"], Value::Null);
+    assert_eq!(included("Object").await["rows"][0]["object"]["kind"], "Task");
+    let one = table(&admin, &format!("{TASKS}/t")).await;
+    assert_eq!((&one["kind"], one["rows"].as_array().unwrap().len()), (&json!("Table"), 1));
+    let refused = get(&admin, &format!("{TASKS}?includeObject=All")).await;
+    assert_eq!(refused.0, 200, "it says nothing of other forms");
+    cluster.running.shut_down().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn what_is_only_read_is_not_written() {
+    let cluster = Cluster::start().await;
+    let admin = cluster.admin().await;
+    send(&admin, "POST", TASKS, task("t")).await;
+    for sub in ["log", "why"] {
+        for method in ["POST", "PUT", "PATCH", "DELETE"] {
+            let refused = send(&admin, method, &format!("{TASKS}/t/{sub}"), json!({})).await;
+            assert_eq!(refusal(&refused), (405, "MethodNotAllowed"), "{method} {sub}");
+        }
+        assert_ne!(get(&admin, &format!("{TASKS}/t/{sub}")).await.0, 405);
+    }
     cluster.running.shut_down().await.unwrap();
 }
 
@@ -213,6 +309,7 @@ async fn discovery_tells_what_there_is() {
             "nodes/status",
             "quotas",
             "quotas/status",
+            "sites",
             "tasks",
             "tasks/log",
             "tasks/status",

@@ -60,6 +60,47 @@ async fn a_watch_begins_where_it_is_told_to() {
     assert!(all.next().await.is_none(), "a shutdown ends watches");
 }
 
+/// Python's client writes `True`; and a time that no clock can count is no fault.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_watch_is_asked_for_in_many_ways() {
+    let cluster = Cluster::start().await;
+    let admin = cluster.admin().await;
+    send(&admin, "POST", EVENTS, event("a")).await;
+    for query in ["watch=True", "watch=yes", "watch=true&timeoutSeconds=18446744073709551615"] {
+        let mut watch = Lines::open(&admin, &format!("{EVENTS}?{query}")).await;
+        assert_eq!(watch.event().await, "ADDED a", "{query}");
+        let poses = format!("/apis/muster.dev/v1alpha1/poses?{query}");
+        let end = Lines::open(&admin, &poses).await.next().await.unwrap();
+        assert_eq!(end["type"], "BOOKMARK", "{query}");
+    }
+    cluster.running.shut_down().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_watch_of_tables_is_of_tables() {
+    let cluster = Cluster::start().await;
+    let admin = cluster.admin().await;
+    send(&admin, "POST", EVENTS, event("a")).await;
+    let query = "watch=true&allowWatchBookmarks=true&sendInitialEvents=true&resourceVersionMatch=NotOlderThan";
+    let accept = "application/json;as=Table;v=v1;g=meta.k8s.io";
+    let request = Request::get(format!("{EVENTS}?{query}")).header("accept", accept);
+    let reader = admin.request_stream(request.body(Vec::new()).unwrap()).await.unwrap();
+    let reader = Box::pin(reader) as std::pin::Pin<Box<dyn futures::AsyncBufRead + Send>>;
+    let mut watch = Lines(reader.lines());
+    let first = watch.next().await.unwrap();
+    assert_eq!((&first["type"], &first["object"]["kind"]), (&json!("ADDED"), &json!("Table")));
+    assert_eq!(first["object"]["rows"][0]["object"]["metadata"]["name"], "a");
+    let end = watch.next().await.unwrap();
+    assert_eq!((&end["type"], &end["object"]["kind"]), (&json!("BOOKMARK"), &json!("Table")));
+    assert!(end["object"]["metadata"]["resourceVersion"].is_string());
+    let marked = &end["object"]["rows"][0]["object"]["metadata"]["annotations"];
+    assert_eq!(marked["k8s.io/initial-events-end"], "true");
+    send(&admin, "POST", EVENTS, event("b")).await;
+    let later = watch.next().await.unwrap();
+    assert_eq!(later["object"]["rows"][0]["object"]["metadata"]["name"], "b");
+    cluster.running.shut_down().await.unwrap();
+}
+
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn leaving_the_selection_is_a_deletion() {
     let cluster = Cluster::start().await;
@@ -74,6 +115,51 @@ async fn leaving_the_selection_is_a_deletion() {
     }
     send(&admin, "PATCH", &path, json!({"metadata": {"labels": {"other": "y"}}})).await;
     assert_eq!(watch.event().await, "MODIFIED x");
+    let (_, red) =
+        send(&admin, "PATCH", &path, json!({"metadata": {"labels": {"app": "red"}}})).await;
+    let left = watch.next().await.unwrap();
+    assert_eq!(left["object"]["metadata"]["labels"]["app"], "blue", "as it was last selected");
+    assert_eq!(left["object"]["metadata"]["resourceVersion"], red["metadata"]["resourceVersion"]);
+    cluster.running.shut_down().await.unwrap();
+}
+
+/// As client-go's reflector asks for it: what there is as events, then the word that this was all, then what changes.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_list_that_is_streamed_says_where_it_ends() {
+    let cluster = Cluster::start().await;
+    let admin = cluster.admin().await;
+    let (_, a) = send(&admin, "POST", EVENTS, event("a")).await;
+    send(&admin, "POST", EVENTS, event("b")).await;
+    let at = a["metadata"]["resourceVersion"].as_str().unwrap();
+    let asked = "allowWatchBookmarks=true&resourceVersionMatch=NotOlderThan&sendInitialEvents=true";
+    for revision in ["", "0", at] {
+        let query = format!("watch=true&resourceVersion={revision}&timeoutSeconds=60&{asked}");
+        let mut list = Lines::open(&admin, &format!("{EVENTS}?{query}")).await;
+        assert_eq!((&*list.event().await, &*list.event().await), ("ADDED a", "ADDED b"));
+        let end = list.next().await.unwrap();
+        assert_eq!(end["type"], "BOOKMARK");
+        assert_eq!(end["object"]["metadata"]["annotations"]["k8s.io/initial-events-end"], "true");
+        send(&admin, "POST", EVENTS, event("c")).await;
+        assert_eq!(list.event().await, "ADDED c");
+        send(&admin, "DELETE", &format!("{EVENTS}/c"), Value::Null).await;
+    }
+    let refused = |query: &'static str| {
+        let (admin, path) = (admin.clone(), format!("{EVENTS}?{query}"));
+        async move { get(&admin, &path).await }
+    };
+    for query in [
+        "watch=true&sendInitialEvents=true",
+        "watch=true&resourceVersionMatch=NotOlderThan&resourceVersion=1",
+        "sendInitialEvents=true&resourceVersionMatch=NotOlderThan",
+        "resourceVersionMatch=Exact",
+        "resourceVersionMatch=Exact&resourceVersion=0",
+        "resourceVersionMatch=Nearly&resourceVersion=1",
+    ] {
+        assert_eq!(refusal(&refused(query).await), (422, "Invalid"), "{query}");
+    }
+    let ahead = format!("watch=true&resourceVersion=99999&{asked}");
+    let ahead = get(&admin, &format!("{EVENTS}?{ahead}")).await;
+    assert_eq!(refusal(&ahead), (504, "Timeout"));
     cluster.running.shut_down().await.unwrap();
 }
 

@@ -140,14 +140,16 @@ impl Shared {
     }
 
     fn leave(&self, what: Leaving) {
-        let mut topics = self.topics();
+        self.leave_from(&mut self.topics(), what);
+    }
+
+    fn leave_from(&self, topics: &mut Topics, what: Leaving) {
         match &what {
             Leaving::Subscription(topic) => drop(topics.subscriptions.remove(topic)),
             Leaving::Publication(topic) => drop(topics.publications.remove(topic)),
             Leaving::Param(key) => drop(topics.params.remove(key)),
         }
         topics.leaving.insert(what);
-        drop(topics);
         self.work.notify_one();
     }
 }
@@ -264,7 +266,8 @@ impl Node {
         topic: &str,
         options: SubscribeOptions,
     ) -> Result<Subscriber<M>, NodeError> {
-        let subscription = self.add(topic, (M::TYPE, M::MD5), options, None)?;
+        let mut topics = self.shared.topics();
+        let subscription = self.add(&mut topics, topic, (M::TYPE, M::MD5), options)?;
         Ok(Subscriber::new(subscription, Arc::clone(&self.shared)))
     }
 
@@ -278,37 +281,54 @@ impl Node {
         topic: &str,
         options: SubscribeOptions,
     ) -> Result<Subscriber<Incoming>, NodeError> {
-        let subscription = self.add(topic, ("*", "*"), options, None)?;
+        let mut topics = self.shared.topics();
+        let subscription = self.add(&mut topics, topic, ("*", "*"), options)?;
         Ok(Subscriber::new(subscription, Arc::clone(&self.shared)))
     }
 
-    /// Subscribes to a topic only to learn how often it is published: messages are counted as they pass, and not kept.
+    /// Subscribes to a topic only to learn how often it is published: messages are counted as they pass, and not kept. A
+    /// topic that is counted already is counted over one more window, by the same subscription.
     ///
     /// # Errors
     ///
     /// As [`Node::subscribe`].
     pub fn count(&self, topic: &str, window: Duration) -> Result<Arrivals, NodeError> {
-        let subscription =
-            self.add(topic, ("*", "*"), SubscribeOptions::default(), Some(window))?;
-        Ok(Arrivals::new(subscription, Arc::clone(&self.shared)))
+        let mut topics = self.shared.topics();
+        let counted = topics.subscriptions.get(&self.names.resolve(topic)?);
+        let subscription = match counted.filter(|subscription| subscription.only_counts()) {
+            Some(subscription) => Arc::clone(subscription),
+            None => {
+                self.begin(&mut topics, topic, ("*", "*"), SubscribeOptions::default(), true)?
+            }
+        };
+        Ok(Arrivals::new(subscription, Arc::clone(&self.shared), window))
     }
 
     fn add(
         &self,
+        topics: &mut Topics,
         topic: &str,
         kind: (&'static str, &'static str),
         options: SubscribeOptions,
-        count: Option<Duration>,
+    ) -> Result<Arc<Subscription>, NodeError> {
+        self.begin(topics, topic, kind, options, false)
+    }
+
+    fn begin(
+        &self,
+        topics: &mut Topics,
+        topic: &str,
+        kind: (&'static str, &'static str),
+        options: SubscribeOptions,
+        counts: bool,
     ) -> Result<Arc<Subscription>, NodeError> {
         let topic = self.names.resolve(topic)?;
-        let mut topics = self.shared.topics();
         if topics.subscriptions.contains_key(&topic) {
             return Err(NodeError::Twice { what: "subscribes", topic });
         }
         topics.leaving.remove(&Leaving::Subscription(topic.clone()));
-        let subscription = Subscription::start(&self.shared, topic.clone(), kind, options, count);
+        let subscription = Subscription::start(&self.shared, topic.clone(), kind, options, counts);
         topics.subscriptions.insert(topic, Arc::clone(&subscription));
-        drop(topics);
         self.shared.work.notify_one();
         Ok(subscription)
     }

@@ -2,7 +2,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::marker::PhantomData;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
@@ -90,10 +90,10 @@ pub struct Subscription {
     kind: &'static str,
     md5: &'static str,
     options: SubscribeOptions,
-    /// Messages are counted only, over this window.
-    count: Option<Duration>,
     queue: Queue<Incoming>,
-    meter: Mutex<RateMeter>,
+    /// Messages are counted only, by each of these.
+    meters: Option<Mutex<BTreeMap<u64, RateMeter>>>,
+    next_meter: AtomicU64,
     began: Instant,
     publishers: watch::Sender<Publishers>,
     /// By publisher: connected, or why not.
@@ -111,16 +111,16 @@ impl Subscription {
         topic: String,
         (kind, md5): (&'static str, &'static str),
         options: SubscribeOptions,
-        count: Option<Duration>,
+        counts: bool,
     ) -> Arc<Subscription> {
         let subscription = Arc::new(Subscription {
             topic,
             kind,
             md5,
             queue: Queue::new(options.queue),
-            meter: Mutex::new(RateMeter::new(count.unwrap_or(Duration::from_secs(1)))),
+            meters: counts.then(Mutex::default),
+            next_meter: AtomicU64::new(0),
             options,
-            count,
             began: Instant::now(),
             publishers: watch::Sender::new(Publishers::default()),
             peers: watch::Sender::new(BTreeMap::new()),
@@ -152,11 +152,14 @@ impl Subscription {
 
     /// Messages are not kept.
     pub(super) fn only_counts(&self) -> bool {
-        self.count.is_some()
+        self.meters.is_some()
     }
 
     pub(super) fn arrived(&self) {
-        lock(&self.meter).arrived(self.began.elapsed());
+        let now = self.began.elapsed();
+        if let Some(meters) = &self.meters {
+            lock(meters).values_mut().for_each(|meter| meter.arrived(now));
+        }
     }
 
     pub(super) fn push(&self, incoming: Incoming) {
@@ -315,23 +318,48 @@ impl<M> Drop for Subscriber<M> {
     }
 }
 
-/// Tells how often a topic is published. When it is dropped, the topic is not subscribed any more.
+/// Tells how often a topic is published. Several may share a subscription, each with a window of its own; when the last one
+/// is dropped, the topic is not subscribed any more.
 #[derive(Debug)]
 pub struct Arrivals {
     subscription: Arc<Subscription>,
     shared: Arc<Shared>,
+    meter: u64,
 }
 
 impl Arrivals {
-    pub(super) fn new(subscription: Arc<Subscription>, shared: Arc<Shared>) -> Self {
-        lock(&subscription.meter).begin(subscription.began.elapsed());
-        Arrivals { subscription, shared }
+    /// Counting begins now. The caller holds the node's topics, so that nobody ends the subscription meanwhile.
+    pub(super) fn new(
+        subscription: Arc<Subscription>,
+        shared: Arc<Shared>,
+        window: Duration,
+    ) -> Self {
+        let meter = subscription.next_meter.fetch_add(1, Ordering::Relaxed);
+        let arrivals = Arrivals { subscription, shared, meter };
+        let mut counts = RateMeter::new(window);
+        counts.begin(arrivals.subscription.began.elapsed());
+        if let Some(meters) = &arrivals.subscription.meters {
+            lock(meters).insert(meter, counts);
+        }
+        arrivals
+    }
+
+    fn of<T: Default>(&self, look: impl FnOnce(&RateMeter, Duration) -> T) -> T {
+        let meters = self.subscription.meters.as_ref().map(lock);
+        let now = self.subscription.began.elapsed();
+        meters.and_then(|meters| Some(look(meters.get(&self.meter)?, now))).unwrap_or_default()
     }
 
     /// Messages a second over the window; `None`: it was not watched for so long yet.
     #[must_use]
     pub fn hertz(&self) -> Option<f64> {
-        lock(&self.subscription.meter).hertz(self.subscription.began.elapsed())
+        self.of(RateMeter::hertz)
+    }
+
+    /// Messages in the window, or since counting began when that is shorter.
+    #[must_use]
+    pub fn in_window(&self) -> u64 {
+        self.of(RateMeter::in_window)
     }
 
     /// How it stands.
@@ -343,7 +371,14 @@ impl Arrivals {
 
 impl Drop for Arrivals {
     fn drop(&mut self) {
-        self.subscription.stop();
-        self.shared.leave(Leaving::Subscription(self.subscription.topic.clone()));
+        let mut topics = self.shared.topics();
+        let Some(meters) = &self.subscription.meters else { return };
+        let mut meters = lock(meters);
+        meters.remove(&self.meter);
+        if meters.is_empty() {
+            self.subscription.stop();
+            self.shared
+                .leave_from(&mut topics, Leaving::Subscription(self.subscription.topic.clone()));
+        }
     }
 }

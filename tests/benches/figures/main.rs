@@ -11,6 +11,7 @@ mod messages;
 mod placement;
 mod poses;
 mod ros;
+mod sensors;
 mod stats;
 mod stops;
 mod submit;
@@ -56,6 +57,9 @@ const FIGURES: &[Figure] = &[
         "a robot's pose from rospy's publish to the controller, against a bare subscriber",
         || Box::pin(ros::pose()),
     ),
+    ("sensors", "a camera of 1 MB and 30 Hz for 1, 8, 64 tasks, against copies and ROS", || {
+        Box::pin(sensors::all())
+    }),
     ("footprint", "RSS and idle CPU of agent and controller", || Box::pin(footprint::all())),
 ];
 
@@ -65,6 +69,9 @@ fn main() -> ExitCode {
         && bare == "bare-stream"
     {
         poses::serve_bare(pki.as_ref());
+        return ExitCode::SUCCESS;
+    }
+    if sensors::role(&asked) {
         return ExitCode::SUCCESS;
     }
     if asked.iter().any(|a| a == "--list") {

@@ -20,7 +20,8 @@ const WATCHERS: usize = 1_000;
 const ALL: usize = 20;
 /// Each object is written so many times, one after the other.
 const ROUNDS: usize = 5;
-const PER_SECOND: f64 = 500.0;
+/// A little more than the bar of 500, which is to be reached with the last write's answer counted in.
+const PER_SECOND: f64 = 520.0;
 
 fn object(i: usize) -> ConfigMap {
     serde_json::from_value(json!({
@@ -38,13 +39,16 @@ async fn follow(api: Api<ConfigMap>, labels: Option<String>, since: String) -> u
     let mut events = api.watch(&params, &since).await.expect("a watch").boxed();
     let wanted = ROUNDS * if labels.is_some() { OBJECTS / SHELVES } else { OBJECTS };
     let mut last: BTreeMap<String, usize> = BTreeMap::new();
-    for _ in 0..wanted {
+    let mut seen = 0;
+    while seen < wanted {
         match events.try_next().await.expect("no error") {
             Some(WatchEvent::Modified(map)) => {
                 let n: usize = map.data.as_ref().expect("data")["n"].parse().expect("a number");
                 let before = last.insert(map.name_any(), n).unwrap_or(0);
                 assert_eq!(n, before + 1, "{} came twice, late or not at all", map.name_any());
+                seen += 1;
             }
+            Some(WatchEvent::Bookmark(_)) => {}
             other => panic!("{other:?}"),
         }
     }
@@ -70,14 +74,25 @@ pub(crate) async fn all() {
     }
     let (mut writes, begin, used) = (Samples::default(), Instant::now(), cpu(controller));
     let mut ticks = tokio::time::interval(Duration::from_secs_f64(1.0 / PER_SECOND));
+    // A write begins at its time, whether those before it are answered or not; those of an object are a round apart.
+    let mut under_way = JoinSet::new();
     for round in 1..=ROUNDS {
         for i in 0..OBJECTS {
             ticks.tick().await;
-            let change = Patch::Merge(json!({"data": {"n": round.to_string()}}));
-            let sent = Instant::now();
-            let name = format!("m{i}");
-            api.patch(&name, &PatchParams::default(), &change).await.expect("written");
-            writes.push(sent.elapsed());
+            let api = api.clone();
+            under_way.spawn(async move {
+                let change = Patch::Merge(json!({"data": {"n": round.to_string()}}));
+                let sent = Instant::now();
+                let name = format!("m{i}");
+                api.patch(&name, &PatchParams::default(), &change).await.expect("written");
+                sent.elapsed()
+            });
+            while let Some(took) = under_way.try_join_next() {
+                writes.push(took.expect("a write was answered"));
+            }
+        }
+        while let Some(took) = under_way.join_next().await {
+            writes.push(took.expect("a write was answered"));
         }
     }
     let rate = (ROUNDS * OBJECTS) as f64 / begin.elapsed().as_secs_f64();
@@ -87,12 +102,18 @@ pub(crate) async fn all() {
     }
     let took = begin.elapsed().as_secs_f64();
     writes.line("PATCH while all watch");
-    figure("writes", rate, "/s", ">= 475/s of 500/s asked for");
+    figure("writes", rate, "/s", ">= 500/s");
     figure("events, each once and in order", delivered as f64 / took, "/s", "all");
     let used = (cpu(controller) - used).as_secs_f64() / took;
+    println!("  load of the machine, 1 min: {}", crate::list::load());
     figure("controller: CPU", used * 100.0, " % of a core", "report");
     let now = rss(controller);
-    figure("controller: RSS", now, " MB", "report");
+    figure(
+        "controller: RSS, all watching",
+        now,
+        " MB",
+        "bounded: what it holds, and 100 kB a watcher",
+    );
     figure(
         "controller: RSS a watcher",
         (now - before) * 1e3 / (WATCHERS + ALL) as f64,

@@ -77,7 +77,12 @@ async fn from_plan_to_delete() {
     );
     assert_eq!(muster(&cluster, &["get", "tasks", "-o", "name"]).1, "", "a plan changes nothing");
 
-    let (code, out, err) = muster(&cluster, &["apply", "-f", file]);
+    let index = plan.split_once("Index: ").and_then(|(_, rest)| rest.split_once(';'));
+    let index = index.expect("a plan has an index").0;
+    let (code, _, err) = muster(&cluster, &["apply", "-f", file, "--check-index", "000000000000"]);
+    assert!(code != 0 && err.contains("have changed since the plan 000000000000"), "{err}");
+    assert_eq!(muster(&cluster, &["get", "tasks", "-o", "name"]).1, "", "nothing was stored");
+    let (code, out, err) = muster(&cluster, &["apply", "-f", file, "--check-index", index]);
     assert_eq!((code, out.as_str()), (0, "task/first created\ntask/second created\n"), "{err}");
     let (code, out, _) = muster(&cluster, &["apply", "-f", file]);
     assert_eq!((code, out.as_str()), (0, "task/first unchanged\ntask/second unchanged\n"));
@@ -87,6 +92,15 @@ async fn from_plan_to_delete() {
         muster(&cluster, &["wait", "task/first", "--for", "phase=Running", "--timeout", "60s"]);
     assert_eq!(code, 0, "{err}");
     cluster.task("second", "refused", |s| !s.why.is_empty()).await;
+    let set = cluster.dir().join("set.yaml");
+    let template = "{spec: {priority: 9, placement: {at: {x: 0, y: 0}}, resources: {actuators: ['base:Drive']}, run: {process: {command: [x]}}}}";
+    let text = format!(
+        "apiVersion: muster.dev/v1alpha1\nkind: TaskSet\nmetadata: {{name: urgent}}\nspec: {{replicas: 1, template: {template}}}\n"
+    );
+    std::fs::write(&set, text).expect("writable");
+    let (code, plan, _) = muster(&cluster, &["plan", "-f", set.to_str().expect("text")]);
+    let lost = "would end on robot: default/first; takes over robot.body";
+    assert!(code == 1 && plan.contains("+ task/urgent-0") && plan.contains(lost), "{plan}");
     let (_, why, _) = muster(&cluster, &["why", "task/second"]);
     assert!(
         why.contains("robot") && why.contains("LeaseHeld") && why.contains("default/first"),

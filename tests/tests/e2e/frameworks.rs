@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 
+use muster_api::kind::task::Task;
 use muster_api::phase::TaskPhase;
 use muster_tests::{AgentOptions, Cluster, Puppet, kernel, puppet, wait};
 use serde_json::{Value, json};
@@ -110,7 +111,10 @@ async fn figure_4_of_avalon_with_frameworks() {
     three
         .holds("the rest", |o| cpu(o, "slave-1") == Some(100) && cpu(o, "slave-2") == Some(0))
         .await;
-    assert_eq!(list(&three.holding, "slave-2", "sensors"), 2);
+    for node in ["slave-1", "slave-2"] {
+        assert_eq!(list(&three.holding, node, "sensors"), 2, "all SR of {node}");
+        assert_eq!(list(&three.holding, node, "actuators"), 0, "and no AR");
+    }
     // A declared task takes from the same books, and the third sees it at once.
     cluster
         .create(
@@ -165,6 +169,32 @@ async fn a_framework_fails_over_or_its_tasks_end() {
     late.holds("the robot's actuators", |o| list(o, "slave-1", "actuators") == 2).await;
 }
 
+/// The controller's own absence is no framework's: however long it lasts, they find their tasks as they were.
+#[tokio::test(flavor = "multi_thread")]
+async fn a_stop_of_the_controller_longer_than_the_failover_timeout_ends_nothing() {
+    let mut cluster = two_robots().await;
+    let info = json!({"name": "patient", "failover_timeout": 0.1});
+    let mut framework = Puppet::start(&cluster, info).await;
+    framework.holds("offers", |o| o.len() == 2).await;
+    let drive = spec(Some("100m"), &[], &["base:Drive"]);
+    let launched = framework.launch(&[("slave-1", "driver", drive)]).await;
+    assert_eq!(launched["event"], "launched", "{launched}");
+    framework.hears("driver", "RUNNING").await;
+    let before = cluster.phase("driver", TaskPhase::Running).await;
+
+    // Sessions end, each with a word in its object, before the process does; the next life takes longer than 0.1 s.
+    kernel::interrupt(cluster.controller_pid());
+    cluster.await_controller();
+    framework.event("the end of the session", |e| e["event"] == "disconnected").await;
+    cluster.start_controller().await;
+    framework.event("it is back", |e| e["event"] == "reregistered").await;
+    framework.holds("offers of the new life", |o| o.len() == 2).await;
+    let after = cluster.phase("driver", TaskPhase::Running).await;
+    assert_eq!(before.metadata.uid, after.metadata.uid);
+    let started = |task: &Task| task.status.as_ref().and_then(|s| s.started_at.clone());
+    assert_eq!(started(&before), started(&after), "it was not started again");
+}
+
 /// An executor stays alive and runs several tasks; what it holds for them ends with it.
 #[tokio::test(flavor = "multi_thread")]
 async fn an_executor_runs_tasks_and_talks_to_its_framework() {
@@ -196,8 +226,13 @@ async fn an_executor_runs_tasks_and_talks_to_its_framework() {
             cpu(o, "slave-1") == Some(800) && known(o).as_ref() == Some(&there)
         })
         .await;
-    let stranger = Puppet::start(&cluster, json!({"name": "stranger"})).await;
-    assert_eq!(known(&holding(stranger).await), Some(json!({})), "it is not the stranger's");
+    let mut stranger = Puppet::start(&cluster, json!({"name": "stranger"})).await;
+    stranger.holds("offers", |o| o.len() == 2).await;
+    assert_eq!(known(&stranger.holding), Some(json!({})), "it is not the stranger's");
+    let refused = stranger.launch(&[("slave-1", "intruder", work.clone())]).await;
+    let why = (refused["reason"].as_str(), refused["message"].to_string());
+    assert!(why.0 == Some("CONFLICT") && why.1.contains("worker"), "nor is its work: {refused}");
+    drop(stranger);
     let launched = framework.launch(&[("slave-1", "work-1", work.clone())]).await;
     assert_eq!(launched["event"], "launched", "{launched}");
     framework.hears("work-1", "RUNNING").await;
@@ -224,19 +259,24 @@ async fn an_executor_runs_tasks_and_talks_to_its_framework() {
     framework.holds("the actuators at last", |o| list(o, "slave-1", "actuators") == 2).await;
 }
 
-/// What a framework is offered first.
-async fn holding(mut framework: Puppet) -> BTreeMap<String, Value> {
-    framework.holds("offers", |o| o.len() == 2).await;
-    framework.holding
-}
-
-/// A framework that does not answer (SIGSTOP) holds offers of everything and holds nobody up; when it goes on, it is told what
-/// is so now.
+/// A framework that does not answer (SIGSTOP) and has less than the others holds offers of everything, and holds up neither
+/// another framework nor declared tasks; when it goes on, it is told what is so now.
 #[tokio::test(flavor = "multi_thread")]
 async fn a_frozen_framework_delays_nobody() {
     let cluster = two_robots().await;
-    let mut frozen = Puppet::start(&cluster, json!({"name": "frozen"})).await;
+    let namespace = json!({"apiVersion": "v1", "kind": "Namespace", "metadata": {"name": "poor"}});
+    cluster.post("/api/v1/namespaces", &namespace).await;
+    let info = json!({"name": "frozen", "namespace": "poor"});
+    let mut frozen = Puppet::start(&cluster, info).await;
     frozen.holds("both robots", |o| o.len() == 2).await;
+    // The other namespace has something already, so it is the one that waits for who has less.
+    let queued = |cpu: &str| {
+        json!({"placement": {"node": "slave-2"}, "resources": {"cpu": cpu, "actuators": ["base:Drive"]},
+            "run": {"process": {"command": ["sleep", "1000"]}}, "gracePeriodSeconds": 0})
+    };
+    cluster.create("first", queued("200m")).await;
+    cluster.phase("first", TaskPhase::Running).await;
+    frozen.holds("what is left of it", |o| cpu(o, "slave-2") == Some(800)).await;
     kernel::freeze(frozen.pid(), true);
 
     let mut lively =
@@ -254,10 +294,43 @@ async fn a_frozen_framework_delays_nobody() {
             lively.hears(&name, "FAILED").await;
         }
     }
+    // Declared tasks take the other robot after one another, though the frozen one is offered it each time.
+    for (before, next) in [("first", "second"), ("second", "third")] {
+        cluster.create(next, queued("200m")).await;
+        cluster.delete(before).await;
+        cluster.phase(next, TaskPhase::Running).await;
+    }
 
     kernel::freeze(frozen.pid(), false);
     let rest = |o: &BTreeMap<String, Value>| {
         cpu(o, "slave-1") == Some(300) && list(o, "slave-1", "actuators") == 0
     };
     frozen.holds("what the other left", rest).await;
+}
+
+/// A robot that declared tasks of one namespace queue for is left to the framework of another that has less, when it comes free.
+#[tokio::test(flavor = "multi_thread")]
+async fn declared_tasks_do_not_starve_a_framework() {
+    let cluster = two_robots().await;
+    let namespace = json!({"apiVersion": "v1", "kind": "Namespace", "metadata": {"name": "lab"}});
+    cluster.post("/api/v1/namespaces", &namespace).await;
+    let queued = |node: &str| {
+        json!({"placement": {"node": node}, "resources": {"actuators": ["base:Drive"]},
+            "run": {"process": {"command": ["sleep", "1000"]}}, "gracePeriodSeconds": 0})
+    };
+    // One robot is the other namespace's for good, and it queues for the second one.
+    cluster.create("other", queued("slave-2")).await;
+    cluster.create("first", queued("slave-1")).await;
+    for name in ["other", "first"] {
+        cluster.phase(name, TaskPhase::Running).await;
+    }
+    cluster.create("second", queued("slave-1")).await;
+    cluster.task("second", "waiting", |s| !s.why.is_empty()).await;
+    let wish = json!({"name": "lab", "namespace": "lab", "filter": {"anyActuator": true}});
+    let mut lab = super::lines::Session::open(&cluster, wish).await;
+    cluster.delete("first").await;
+    // With free actuators: nobody has taken them before it could hear of it.
+    let offer = lab.offer_of("slave-1").await;
+    lab.say(json!({"decline": {"offers": [offer], "refuseSeconds": 3600}})).await;
+    cluster.phase("second", TaskPhase::Running).await;
 }

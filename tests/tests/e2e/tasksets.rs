@@ -18,7 +18,7 @@ async fn sets(cluster: &Cluster) -> Api<TaskSet> {
     Api::namespaced(cluster.client().await, "default")
 }
 
-async fn create(cluster: &Cluster, name: &str, spec: Value) {
+pub(crate) async fn create(cluster: &Cluster, name: &str, spec: Value) {
     let set = json!({
         "apiVersion": muster_api::API_VERSION, "kind": "TaskSet", "metadata": {"name": name}, "spec": spec,
     });
@@ -27,7 +27,7 @@ async fn create(cluster: &Cluster, name: &str, spec: Value) {
 }
 
 /// Waits until a set's status, of its present spec, is as wanted.
-async fn status(
+pub(crate) async fn status(
     cluster: &Cluster,
     name: &str,
     what: &str,
@@ -43,11 +43,11 @@ async fn status(
     set.and_then(|set| set.status).expect("it has a status")
 }
 
-fn says(status: &TaskSetStatus, reason: &str) -> bool {
+pub(crate) fn says(status: &TaskSetStatus, reason: &str) -> bool {
     status.condition("Progressing").is_some_and(|c| c.reason == reason)
 }
 
-async fn complete(cluster: &Cluster, name: &str, tasks: u32) -> TaskSetStatus {
+pub(crate) async fn complete(cluster: &Cluster, name: &str, tasks: u32) -> TaskSetStatus {
     status(cluster, name, "complete", |s| says(s, "Complete") && s.available_replicas == tasks)
         .await
 }
@@ -62,7 +62,7 @@ async fn processes(cluster: &Cluster) -> BTreeMap<String, Vec<Process>> {
     tasks.items.iter().filter_map(row).collect()
 }
 
-async fn patch(cluster: &Cluster, name: &str, change: Value) {
+pub(crate) async fn patch(cluster: &Cluster, name: &str, change: Value) {
     let params = PatchParams::default();
     sets(cluster).await.patch(name, &params, &Patch::Merge(change)).await.expect("it is taken");
 }

@@ -25,7 +25,7 @@ mount -t cgroup2 cgroup /sys/fs/cgroup
 mount -t tmpfs tmp /tmp
 ip link set lo up
 ln -s /t/agent/muster-agent /t/muster-agent
-/t/deps/e2e process --nocapture --test-threads=1
+/t/deps/e2e quotas::process --nocapture --test-threads=1
 plain=$?
 rm /t/muster-agent
 

@@ -8,7 +8,8 @@ use std::time::Duration;
 use futures::{StreamExt as _, TryStreamExt as _};
 use k8s_openapi::api::core::v1::{ConfigMap, Pod};
 use kube::api::{
-    DeleteParams, ListParams, LogParams, Patch, PatchParams, PostParams, WatchEvent, WatchParams,
+    AttachParams, DeleteParams, ListParams, LogParams, Patch, PatchParams, PostParams, WatchEvent,
+    WatchParams,
 };
 use kube::runtime::controller::Action;
 use kube::runtime::{Controller, WatchStreamExt as _, reflector, watcher};
@@ -16,6 +17,7 @@ use kube::{Api, ResourceExt as _};
 use muster_api::kind::task::Task;
 use muster_tests::{AgentOptions, Cluster};
 use serde_json::{Value, json};
+use tokio::io::AsyncReadExt as _;
 
 /// No wait in these tests should take this long; a machine under load may need a good part of it.
 const DEADLINE: Duration = Duration::from_secs(120);
@@ -128,6 +130,18 @@ async fn a_task_is_a_pod_for_the_rust_client() {
         }
     });
     assert_eq!(text.await, "from a task\n");
+    let piped = AttachParams::interactive_tty().tty(false);
+    let mut shell = pods.exec("t", ["sh", "-c", "cat; exit 3"], &piped).await.expect("it begins");
+    let status = shell.take_status().expect("asked for");
+    let mut stdin = shell.stdin().expect("asked for");
+    tokio::io::AsyncWriteExt::write_all(&mut stdin, b"to and fro").await.expect("it is taken");
+    tokio::io::AsyncWriteExt::shutdown(&mut stdin).await.expect("it is taken");
+    let mut text = String::new();
+    let mut stdout = shell.stdout().expect("asked for");
+    in_time("its output", stdout.read_to_string(&mut text)).await.expect("text");
+    let status = in_time("its end", status).await.expect("it is told");
+    let code = status.details.and_then(|details| details.causes?.pop()?.message);
+    assert_eq!((text.as_str(), code.as_deref()), ("to and fro", Some("3")));
     let task = cluster.tasks().await.get("t").await.expect("it is there");
     let ready = |task: &Task| task.status.as_ref().map(|s| s.conditions()).unwrap_or_default();
     assert!(ready(&task).iter().any(|c| c.r#type == "Ready" && c.status == true.into()));

@@ -9,8 +9,13 @@ use base64::engine::general_purpose::STANDARD;
 use kube::config::Kubeconfig;
 use muster_tests::{AgentOptions, Cluster};
 
-fn program(name: &str) -> PathBuf {
-    let python = Path::new(env!("CARGO_MANIFEST_DIR")).join("../target/python/bin").join(name);
+/// The newest client, and the oldest that is tried.
+const NEW: &str = "python";
+const OLD: &str = "python-30";
+
+fn program(environment: &str, name: &str) -> PathBuf {
+    let target = Path::new(env!("CARGO_MANIFEST_DIR")).join("../target");
+    let python = target.join(environment).join("bin").join(name);
     assert!(python.exists(), "{} is missing; tests/run makes it", python.display());
     python
 }
@@ -25,12 +30,21 @@ fn run(command: &mut Command) -> String {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn the_python_client_is_a_client() {
+    works_with(NEW).await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn an_older_python_client_is_a_client() {
+    works_with(OLD).await;
+}
+
+async fn works_with(environment: &str) {
     let mut cluster = Cluster::start().await;
     cluster.join(AgentOptions::cloud("cloud-1")).await;
     let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("clients/stock.py");
-    let mut command = Command::new(program("python"));
+    let mut command = Command::new(program(environment, "python"));
     let said = run(command.arg(script).env("KUBECONFIG", cluster.kubeconfig()));
-    assert_eq!(said, "custom_objects\ndynamic_client\ncore\nwatch_goes_on\n");
+    assert_eq!(said, "custom_objects\ndynamic_client\ncore\nprograms\nwatch_goes_on\n");
 }
 
 /// Nothing that is sent is answered by a 5xx, and the controller is there afterwards.
@@ -48,14 +62,16 @@ async fn no_request_that_the_documents_suggest_is_a_fault() {
     let ca = file("/clusters/0/cluster/certificate-authority-data");
     let certificate = file("/users/0/user/client-certificate-data");
     let key = file("/users/0/user/client-key-data");
+    let hooks = Path::new(env!("CARGO_MANIFEST_DIR")).join("clients/hooks.py");
     for group in [
         "apis/muster.dev/v1alpha1",
         "api/v1",
+        "apis/authentication.k8s.io/v1",
         "apis/authorization.k8s.io/v1",
         "apis/metrics.k8s.io/v1beta1",
     ] {
         let url = format!("https://{}/openapi/v3/{group}", cluster.address());
-        let mut command = Command::new(program("schemathesis"));
+        let mut command = Command::new(program(NEW, "schemathesis"));
         command
             .current_dir(cluster.dir())
             .args(["run", &url, "--url", &format!("https://{}", cluster.address())])
@@ -72,8 +88,8 @@ async fn no_request_that_the_documents_suggest_is_a_fault() {
                 "1",
             ])
             .args(["--generation-database", "none", "--suppress-health-check", "all"])
-            // Logs and watches go on; the health and the fencing of nodes are not in the documents.
-            .args(["--exclude-path-regex", "/log$"])
+            // What follows is asked to end.
+            .env("SCHEMATHESIS_HOOKS", &hooks)
             .arg("--tls-verify")
             .arg(&ca)
             .arg("--request-cert")

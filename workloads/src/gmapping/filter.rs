@@ -48,6 +48,11 @@ impl Filter {
         Filter { particles: vec![first; particles.max(1)], rng: Rng::new(seed), scans: 0 }
     }
 
+    /// Square metres that the likeliest map says something of.
+    pub(super) fn mapped(&self) -> f64 {
+        self.best().map_or(0.0, |p| p.map.known())
+    }
+
     pub(super) fn particles(&self) -> usize {
         self.particles.len()
     }

@@ -162,6 +162,12 @@ impl Grid {
         }
     }
 
+    /// Square metres that are known.
+    pub(super) fn known(&self) -> f64 {
+        let known = self.cells.iter().filter(|cell| cell.odds != 0.0).count();
+        known as f64 * self.resolution * self.resolution
+    }
+
     /// Part of the floor that is known. `is_floor` says what is floor.
     pub(super) fn coverage(&self, is_floor: impl Fn(f64, f64) -> bool) -> f64 {
         let (mut floor, mut known) = (0_u32, 0_u32);

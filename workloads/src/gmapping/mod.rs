@@ -6,12 +6,16 @@
 //!   robot (drives by the scan) ─noisy odometry─▶ ┘      move, match, weigh, resample, draw
 //! ```
 //!
+//! With `--sensor` it is a robot's own laser that it maps by, and the robot's base that it drives, through the gate: see
+//! [`live`].
+//!
 //! Frames: the map frame has its origin where the robot starts; poses are in it, metres and radians.
 //! A scan's beams are in the robot's frame. Simulated time passes by frames, so that a run depends on
 //! the seed alone and not on the machine.
 
 mod filter;
 mod grid;
+mod live;
 mod robot;
 mod world;
 
@@ -37,13 +41,25 @@ pub(super) struct Args {
     /// Beams of a scan, over all directions
     #[arg(long, value_name = "N", default_value_t = 180, value_parser = clap::value_parser!(u32).range(12..=3600))]
     beams: u32,
+    /// Map by this laser of the robot's and drive its base; the task asks for both
+    #[arg(long, value_name = "FUNCTION", conflicts_with_all = ["load", "rate", "units_per_frame", "beams"])]
+    sensor: Option<String>,
+    /// The base that is driven with --sensor
+    #[arg(long, value_name = "FUNCTION", default_value = "base:Drive")]
+    actuator: String,
+    /// Metres around the start that the map has, with --sensor
+    #[arg(long, value_name = "M", default_value = "12", value_parser = run::positive)]
+    extent: f64,
     /// Metres across a cell of the map
     #[arg(long, value_name = "M", default_value = "0.1", value_parser = run::positive)]
     resolution: f64,
 }
 
 pub(super) fn run(args: &Args) -> u8 {
-    run::run(Gmapping::new(args), &args.pacing, Some(LASER_HZ))
+    match &args.sensor {
+        Some(sensor) => live::run(sensor, args),
+        None => run::run(Gmapping::new(args), &args.pacing, Some(LASER_HZ)),
+    }
 }
 
 /// A place and a direction in the map frame: metres, radians.

@@ -27,6 +27,12 @@ const AHEAD: f64 = 0.5;
 pub(super) struct Robot {
     pose: Pose,
     driven: f64,
+    steering: Steering,
+}
+
+/// Where to go by what the laser sees: ahead while nothing is near, else away from it.
+#[derive(Debug, Default)]
+pub(super) struct Steering {
     /// Steps for which it goes on turning, and where to: a choice is kept, or it would tremble.
     turning: u32,
     turn: f64,
@@ -47,7 +53,7 @@ impl Robot {
     /// Drives for a period as the scan suggests. Returns what the wheels say of it: a step in the
     /// frame of the pose before, with the wheels' errors.
     pub(super) fn drive(&mut self, scan: &Scan, world: &World, rng: &mut Rng) -> Pose {
-        let (speed, turn) = self.decide(scan, rng);
+        let (speed, turn) = self.steering.decide(scan, rng);
         let yaw = turn * PERIOD;
         let room = world.cast(self.pose.x, self.pose.y, self.pose.yaw, 10.0) - RADIUS;
         let way = (speed * PERIOD).min(room).max(0.0);
@@ -59,9 +65,11 @@ impl Robot {
             yaw: yaw * (1.0 + rng.normal(TURN_NOISE)) + way * YAW_BIAS + rng.normal(YAW_NOISE),
         }
     }
+}
 
+impl Steering {
     /// Speed, m/s, and turn, rad/s.
-    fn decide(&mut self, scan: &Scan, rng: &mut Rng) -> (f64, f64) {
+    pub(super) fn decide(&mut self, scan: &Scan, rng: &mut Rng) -> (f64, f64) {
         if self.turning > 0 {
             self.turning -= 1;
             return (0.0, self.turn);

@@ -6,29 +6,8 @@
 
 use std::fmt;
 
+use muster_api::kind::node::estop::EStopTier as Tier;
 use serde::{Deserialize, Serialize};
-
-/// How far the robot is stopped. The order is that of restriction.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
-pub enum Tier {
-    /// It may move.
-    #[default]
-    None,
-    /// The stop command is given, and no other command passes.
-    Settle,
-    /// The same, and the driver is told to cut the motors' power.
-    Cut,
-}
-
-impl fmt::Display for Tier {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(match self {
-            Tier::None => "None",
-            Tier::Settle => "Settle",
-            Tier::Cut => "Cut",
-        })
-    }
-}
 
 /// Who demands a stop.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]

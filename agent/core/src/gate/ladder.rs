@@ -31,7 +31,8 @@ pub struct Step {
 /// within a quarter of a second. Base drivers wait 250 ms to 3 s by themselves, and some for ever.
 pub const DEFAULT: &[Step] = &[Step { after_ms: 200, action: Action::Stop }];
 
-/// The steps, and how far down it is.
+/// The steps for a silent driver, and how far down it is. [`Action::Release`] is none of them: it is about the holder's life,
+/// not about its commands.
 #[derive(Debug, Clone)]
 pub(super) struct Ladder {
     steps: Vec<Step>,
@@ -42,8 +43,8 @@ impl Ladder {
     /// Steps in the order of their times.
     #[must_use]
     pub(super) fn new(mut steps: Vec<Step>) -> Ladder {
-        // A sign of life puts off a release and nothing else, so nothing stands behind it.
-        steps.sort_by_key(|step| (step.action == Action::Release, step.after_ms));
+        steps.retain(|step| step.action != Action::Release);
+        steps.sort_by_key(|step| step.after_ms);
         Ladder { steps, taken: usize::MAX }
     }
 
@@ -57,11 +58,11 @@ impl Ladder {
         self.taken = usize::MAX;
     }
 
-    /// The steps that are due. `commanded` and `seen`: when the last command and the last sign of life came.
-    pub(super) fn due(&mut self, commanded: Boot, seen: Boot, now: Boot) -> Vec<Action> {
+    /// The steps that are due. `commanded`: when the last command came.
+    pub(super) fn due(&mut self, commanded: Boot, now: Boot) -> Vec<Action> {
         let mut due = Vec::new();
         while let Some(step) = self.steps.get(self.taken) {
-            if step.at(commanded, seen) > now {
+            if commanded.plus(step.after_ms) > now {
                 break;
             }
             due.push(step.action);
@@ -72,15 +73,8 @@ impl Ladder {
 
     /// When the next step is due.
     #[must_use]
-    pub(super) fn next(&self, commanded: Boot, seen: Boot) -> Option<Boot> {
-        self.steps.get(self.taken).map(|step| step.at(commanded, seen))
-    }
-}
-
-impl Step {
-    fn at(self, commanded: Boot, seen: Boot) -> Boot {
-        let from = if self.action == Action::Release { seen } else { commanded };
-        from.plus(self.after_ms)
+    pub(super) fn next(&self, commanded: Boot) -> Option<Boot> {
+        self.steps.get(self.taken).map(|step| commanded.plus(step.after_ms))
     }
 }
 
@@ -89,23 +83,19 @@ mod tests {
     use super::*;
 
     #[test]
-    fn each_step_once_and_release_only_without_a_sign_of_life() {
+    fn each_step_once() {
         let step = |after_ms, action| Step { after_ms, action };
         let mut ladder = Ladder::new(vec![
             step(500, Action::Release),
-            step(100, Action::Log),
             step(200, Action::Stop),
+            step(100, Action::Log),
         ]);
         let at = Boot(1_000);
-        assert!(ladder.due(at, at, Boot(9_000)).is_empty(), "nobody has driven");
+        assert!(ladder.due(at, Boot(9_000)).is_empty(), "nobody has driven");
         ladder.commanded();
-        assert_eq!(ladder.next(at, at), Some(Boot(1_100)));
-        assert!(ladder.due(at, at, Boot(1_099)).is_empty());
-        assert_eq!(ladder.due(at, at, Boot(1_250)), [Action::Log, Action::Stop]);
-        let seen = Boot(1_400);
-        assert!(ladder.due(at, seen, Boot(1_600)).is_empty());
-        assert_eq!(ladder.next(at, seen), Some(Boot(1_900)));
-        assert_eq!(ladder.due(at, seen, Boot(1_900)), [Action::Release]);
-        assert_eq!(ladder.next(at, seen), None);
+        assert_eq!(ladder.next(at), Some(Boot(1_100)));
+        assert!(ladder.due(at, Boot(1_099)).is_empty());
+        assert_eq!(ladder.due(at, Boot(1_250)), [Action::Log, Action::Stop]);
+        assert_eq!(ladder.next(at), None);
     }
 }

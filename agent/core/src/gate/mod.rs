@@ -33,9 +33,10 @@ use muster_api::id::{Epoch, TaskUid};
 use serde::{Deserialize, Serialize};
 
 use crate::time::Boot;
-pub use estop::{EStop, Source, Tier};
+pub use estop::{EStop, Source};
 use ladder::Ladder;
 pub use ladder::{Action, DEFAULT as DEFAULT_LADDER, Step};
+pub use muster_api::kind::node::estop::EStopTier as Tier;
 pub use token::{DEEPEST, Relation, Token, TokenError};
 
 /// A connection to the gate. Numbers are never used twice.
@@ -213,7 +214,6 @@ enum Grip {
 struct Driving {
     conn: Conn,
     commanded: Boot,
-    seen: Boot,
     /// Nothing has stopped the robot since.
     moves: bool,
 }
@@ -237,6 +237,8 @@ pub struct Gate {
     conns: BTreeMap<Conn, TaskUid>,
     driving: Option<Driving>,
     ladder: Ladder,
+    /// The last sign of life of whoever may drive, once somebody has driven with the grant.
+    alive: Option<Boot>,
     grip: Grip,
 }
 
@@ -255,6 +257,7 @@ impl Gate {
             conns: BTreeMap::new(),
             driving: None,
             ladder,
+            alive: None,
             grip: Grip::Lost,
         };
         let mut effects = vec![Effect::Stop(StopReason::GateStarts)];
@@ -304,17 +307,25 @@ impl Gate {
             Event::Opened(conn, task) => drop(self.conns.insert(*conn, task.clone())),
             Event::Closed(conn) => {
                 self.conns.remove(conn);
+                // Its task has ended, or will say something again: that it is silent is the runtime's to judge.
+                if self
+                    .grant
+                    .as_ref()
+                    .is_some_and(|grant| !self.conns.values().any(|task| *task == grant.holder))
+                {
+                    self.alive = None;
+                }
                 if self.driving.is_some_and(|driving| driving.conn == *conn) {
                     self.stop(StopReason::HolderGone, &mut effects);
                 }
             }
-            Event::Command(conn, token) => self.command(*conn, token, now, &mut effects),
-            Event::Retain(conn) => {
-                if let Some(driving) = self.driving.as_mut().filter(|d| d.conn == *conn) {
-                    driving.seen = now;
-                }
+            Event::Command(conn, token) => {
+                self.lives(*conn, now);
+                self.command(*conn, token, now, &mut effects);
             }
+            Event::Retain(conn) => self.lives(*conn, now),
             Event::Delegate(conn, token, to) => {
+                self.lives(*conn, now);
                 let verdict = self.delegate(*conn, token, to, &mut effects);
                 effects.push(Effect::Answer(verdict));
             }
@@ -331,13 +342,12 @@ impl Gate {
     }
 
     fn wake(&self) -> Option<Boot> {
-        let silent =
-            self.driving.and_then(|driving| self.ladder.next(driving.commanded, driving.seen));
+        let silent = self.driving.and_then(|driving| self.ladder.next(driving.commanded));
         let grip = match self.grip {
             Grip::Until(when) => Some(when),
             Grip::Held | Grip::Lost => None,
         };
-        silent.into_iter().chain(grip).min()
+        silent.into_iter().chain(grip).chain(self.given_back_at()).min()
     }
 
     fn pass_time(&mut self, now: Boot, effects: &mut Vec<Effect>) {
@@ -347,8 +357,12 @@ impl Gate {
             self.grip = Grip::Lost;
             self.stop(StopReason::AgentGone, effects);
         }
+        if self.given_back_at().is_some_and(|when| when <= now) {
+            self.alive = None;
+            effects.extend(self.grant.clone().map(Effect::GiveBack));
+        }
         let Some(driving) = self.driving else { return };
-        for action in self.ladder.due(driving.commanded, driving.seen, now) {
+        for action in self.ladder.due(driving.commanded, now) {
             match action {
                 Action::Log => effects.push(Effect::Silent),
                 Action::Hold => effects.push(Effect::Hold),
@@ -356,8 +370,25 @@ impl Gate {
                     self.driving = Some(Driving { moves: false, ..driving });
                     effects.push(Effect::Stop(StopReason::Silent));
                 }
-                Action::Release => effects.extend(self.grant.clone().map(Effect::GiveBack)),
+                Action::Release => {}
             }
+        }
+    }
+
+    /// The grant is given back when neither its holder nor a delegate has said anything for that long. A robot that is stopped
+    /// meanwhile changes nothing in that.
+    fn given_back_at(&self) -> Option<Boot> {
+        let steps = self.settings.ladder.iter().filter(|step| step.action == Action::Release);
+        let after = steps.map(|step| step.after_ms).min()?;
+        Some(self.alive?.plus(after))
+    }
+
+    /// A sign of life, if it is of one who may drive.
+    fn lives(&mut self, conn: Conn, now: Boot) {
+        let Some(task) = self.conns.get(&conn) else { return };
+        let holds = self.grant.as_ref().is_some_and(|grant| grant.holder == *task);
+        if self.alive.is_some() && (holds || self.delegates.iter().any(|d| d.to == *task)) {
+            self.alive = Some(now);
         }
     }
 
@@ -391,6 +422,7 @@ impl Gate {
         }
         let before = std::mem::replace(&mut self.grant, grant.cloned());
         self.delegates.clear();
+        self.alive = None;
         // The robot first, the record after. The new holder hears of its right when the record is there.
         if before.is_some() {
             self.former = before;
@@ -419,7 +451,8 @@ impl Gate {
         let verdict = self.judge(conn, token);
         if verdict == Verdict::Ok {
             self.accept(token, effects);
-            self.driving = Some(Driving { conn, commanded: now, seen: now, moves: true });
+            self.driving = Some(Driving { conn, commanded: now, moves: true });
+            self.alive = Some(now);
             self.ladder.commanded();
             effects.push(Effect::Forward);
         }

@@ -149,6 +149,35 @@ fn without_its_agent_nobody_drives() {
 }
 
 #[test]
+fn a_grant_is_given_back_when_nobody_of_it_says_anything() {
+    let ladder = [(100, Action::Stop), (500, Action::Release)];
+    let ladder = ladder.map(|(after_ms, action)| Step { after_ms, action }).to_vec();
+    let settings = Settings { ladder, ..Settings::default() };
+    let (mut gate, _) = Gate::start(settings, Kept::default());
+    for event in [Event::Opened(A, uid("a")), Event::Opened(B, uid("b")), grant(6, "a")] {
+        let _ = gate.handle(&event, Boot(0));
+    }
+    let gives = |response: &Response| {
+        response
+            .effects
+            .iter()
+            .any(|effect| matches!(effect, Effect::GiveBack(g) if g.epoch == Epoch(6)))
+    };
+    // Who has never driven need not say anything.
+    assert!(!gives(&gate.handle(&Event::Tick, Boot(60_000))));
+    let _ = gate.handle(&Event::Delegate(A, token("6,1"), uid("b")), Boot(60_000));
+    let _ = gate.handle(&Event::Command(B, token("6,1")), Boot(60_000));
+    // The delegate hangs, and the holder is there.
+    let _ = gate.handle(&Event::Retain(A), Boot(60_400));
+    // A stop in between is no sign of life.
+    let stopped = gate.handle(&Event::EStop(Source::Controller, Tier::Settle), Boot(60_450));
+    assert_eq!(stopped.wake, Some(Boot(60_900)));
+    assert!(!gives(&gate.handle(&Event::Tick, Boot(60_899))));
+    assert!(gives(&gate.handle(&Event::Tick, Boot(60_900))));
+    assert!(!gives(&gate.handle(&Event::Tick, Boot(99_000))), "once");
+}
+
+#[test]
 fn an_emergency_stop_is_before_everything() {
     let mut gate = gate();
     assert_eq!(verdict(&mut gate, A, "6"), Verdict::Ok);

@@ -14,6 +14,7 @@ use crate::executor;
 use crate::gate;
 use crate::runtime::cgroup::device;
 use crate::runtime::launch::{Container, Launch, Limits, Network, Program};
+use crate::sensor;
 
 /// Whose container it is.
 pub(super) const LABEL_AGENT: &str = "muster.dev/agent";
@@ -27,6 +28,9 @@ const RUN_DIR: &str = "/run/muster";
 
 /// Where a container sees the directory of its executor socket.
 const EXECUTOR_DIR: &str = "/run/muster-executor";
+
+/// Where a container finds its sensors' sockets, in its run directory.
+const SENSORS_DIR: &str = "/run/muster/sensors";
 
 /// Where a container finds the gate's socket.
 const GATE_DIR: &str = "/run/muster-gate";
@@ -54,6 +58,9 @@ pub(super) fn body(launch: &Launch, config: &DockerConfig) -> Result<ContainerCr
     env.insert(executor::SOCKET_ENV.to_owned(), socket);
     if env.contains_key(gate::SOCKET_ENV) {
         env.insert(gate::SOCKET_ENV.to_owned(), format!("{GATE_DIR}/{}", gate::SOCKET));
+    }
+    if env.contains_key(sensor::DIR_ENV) {
+        env.insert(sensor::DIR_ENV.to_owned(), SENSORS_DIR.to_owned());
     }
     // Who may use the engine sees them, as everything of a container.
     let given = launch.given.iter().flat_map(|given| &given.variables);
@@ -97,6 +104,10 @@ fn host(
     let gate = launch.env.get(gate::SOCKET_ENV).map(Path::new).and_then(Path::parent);
     if let Some(dir) = gate.filter(|dir| dir.exists()) {
         mounts.push(mount(&dir.display().to_string(), GATE_DIR, true));
+    }
+    let sensors = launch.env.get(sensor::DIR_ENV).filter(|dir| Path::new(dir).exists());
+    if let Some(dir) = sensors {
+        mounts.push(mount(dir, SENSORS_DIR, true));
     }
     mounts.extend(container.mounts.iter().map(|m| mount(&m.host, &m.container, m.read_only)));
     let files = config.files.bound(launch);

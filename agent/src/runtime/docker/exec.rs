@@ -8,24 +8,25 @@ use bollard::exec::{StartExecOptions, StartExecResults};
 use bollard::models::ExecConfig;
 use futures::StreamExt;
 use futures::future::BoxFuture;
-use rustix::process::{Pid, Signal};
+use rustix::process::Pid;
 
 use super::inspect::{self, Seen};
+use crate::runtime::process::kill_session;
 use crate::runtime::{Executed, KEPT_WORDS, Reached, RuntimeError};
 
 /// What a shell, and the engine, return for a program that cannot be executed, and for one that is not there.
 const NOT_STARTED: [i64; 2] = [126, 127];
 
-fn failed<E: std::error::Error + Send + Sync + 'static>(error: E) -> RuntimeError {
+pub(super) fn failed<E: std::error::Error + Send + Sync + 'static>(error: E) -> RuntimeError {
     RuntimeError::new("run a program in a container", error)
 }
 
 /// How long the engine may take to say which process a program is that is to be killed.
 const KILLED_WITHIN: Duration = Duration::from_secs(2);
 
-/// Kills a program with its process group. The engine has no word for that: it says which process of this node it is,
+/// Kills a program with its session. The engine has no word for that: it says which process of this node it is,
 /// as soon as it has started it, and made it the leader of its session.
-async fn kill(docker: &Docker, id: &str) {
+pub(super) async fn kill(docker: &Docker, id: &str) {
     let killed = async {
         loop {
             let Ok(seen) = docker.inspect_exec(id).await else { return };
@@ -35,15 +36,15 @@ async fn kill(docker: &Docker, id: &str) {
             }
             let pid = seen.pid.and_then(|pid| i32::try_from(pid).ok()).and_then(Pid::from_raw);
             if let Some(pid) = pid {
-                // An error says that it is gone.
-                let _ = rustix::process::kill_process_group(pid, Signal::KILL);
+                // Threads of the agent wait for nothing, and this may.
+                let _ = tokio::task::spawn_blocking(move || kill_session(pid)).await;
                 return;
             }
             tokio::time::sleep(Duration::from_millis(20)).await;
         }
     };
     if tokio::time::timeout(KILLED_WITHIN, killed).await.is_err() {
-        tracing::warn!(exec = id, "a check in a container may live on until its container ends");
+        tracing::warn!(exec = id, "a program in a container may live on until its container ends");
     }
 }
 
@@ -77,11 +78,15 @@ pub(super) async fn exec(
     }
     let code = docker.inspect_exec(&id).await.map_err(failed)?.exit_code.unwrap_or(-1);
     let said = text(&said);
-    // The engine says in the program's own words that there is none.
-    if NOT_STARTED.contains(&code) && said.contains("OCI runtime exec failed") {
+    if not_started(code, &said) {
         return Ok(Executed::NotStarted(said));
     }
     Ok(Executed::Ended { code: i32::try_from(code).unwrap_or(-1), said })
+}
+
+/// The engine says in the program's own words that there is none.
+fn not_started(code: i64, said: &str) -> bool {
+    NOT_STARTED.contains(&code) && said.contains("OCI runtime exec failed")
 }
 
 fn text(said: &[u8]) -> String {

@@ -7,6 +7,7 @@
 //! | [`create`] | a launch as the engine wants it |
 //! | [`inspect`] | what the engine says of a container, as the core wants it |
 //! | [`exec`] | programs inside a running container: its checks |
+//! | [`interact`], [`hijack`] | the same for clients, with their input and output |
 //! | [`guard`] | the process that ends a container when the agent cannot |
 //!
 //! Level-triggered: an event only says which container to look at; after every reconnection each is
@@ -16,10 +17,12 @@ mod create;
 mod engine;
 mod exec;
 mod guard;
+mod hijack;
 mod inspect;
+mod interact;
 
 use std::collections::BTreeMap;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::Child;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
@@ -41,11 +44,12 @@ use tokio::sync::Notify;
 use super::cgroup::group::Group;
 use super::process::{KEPT_ATTEMPTS, Reexec};
 use super::{
-    AttemptId, Executed, Launch, Launched, Limits, LogQuery, Reached, Runtime, RuntimeError,
-    RuntimeStatus, Used,
+    AttemptId, Executed, IMAGE_PULL_FAILED, Launch, Launched, Limits, LogQuery, Reached, Runtime,
+    RuntimeError, RuntimeStatus, Used,
 };
 use crate::clock;
 use crate::driver::chain;
+use crate::exec::ends::{Ends, Invocation, Outlet, Ran};
 use crate::given::files::Place;
 use crate::runtime::launch::{Container, Network, Program, Pull};
 use engine::Engine;
@@ -116,26 +120,31 @@ impl DockerRuntime {
         self.0.engine.client().map_err(error)
     }
 
-    async fn prepare(&self, container: &Container) -> Result<(), Failure> {
+    fn socket(&self) -> Result<&Path, RuntimeError> {
+        let socket = self.0.config.socket.as_deref();
+        socket.ok_or_else(|| RuntimeError::new("reach the Docker Engine", "there is none"))
+    }
+
+    async fn fetch(&self, image: &str, pull: Pull) -> Result<(), Failure> {
         let failed = |message: String| Failure {
-            reason: "ImagePullFailed".to_owned(),
-            message: format!("image {:?}: {message}", container.image),
+            reason: IMAGE_PULL_FAILED.to_owned(),
+            message: format!("image {image:?}: {message}"),
             retry: true,
         };
         let docker = self.client().map_err(|error| self.unavailable(&error))?;
-        let present = match docker.inspect_image(&container.image).await {
+        let present = match docker.inspect_image(image).await {
             Ok(_) => true,
             Err(error) if inspect::is_missing(&error) => false,
             Err(error) => return Err(self.unavailable(&error)),
         };
-        match (container.pull, present) {
+        match (pull, present) {
             (Pull::Never, false) => {
                 return Err(failed("it is not on this node, and pullPolicy is Never".to_owned()));
             }
             (Pull::Never | Pull::IfNotPresent, true) => return Ok(()),
             (Pull::IfNotPresent, false) | (Pull::Always, _) => {}
         }
-        let (image, tag) = create::image_and_tag(&container.image);
+        let (image, tag) = create::image_and_tag(image);
         let options = CreateImageOptionsBuilder::new().from_image(image).tag(tag).build();
         let mut progress = docker.create_image(Some(options), None, None).boxed();
         while let Some(step) = progress.next().await {
@@ -426,9 +435,13 @@ impl Runtime for DockerRuntime {
 
     fn prepare<'a>(&'a self, launch: &'a Launch) -> BoxFuture<'a, Result<(), Failure>> {
         match &launch.program {
-            Program::Container(container) => self.prepare(container).boxed(),
+            Program::Container(Container { image, pull, .. }) => self.fetch(image, *pull).boxed(),
             Program::Process { .. } | Program::Work(_) => futures::future::ready(Ok(())).boxed(),
         }
+    }
+
+    fn fetch<'a>(&'a self, image: &'a str, pull: Pull) -> BoxFuture<'a, Result<(), Failure>> {
+        self.fetch(image, pull).boxed()
     }
 
     fn launch<'a>(&'a self, launch: &'a Launch) -> BoxFuture<'a, Launched> {
@@ -475,6 +488,37 @@ impl Runtime for DockerRuntime {
             exec::exec(&docker, &self.name(&launch.id), argv, until).await
         }
         .boxed()
+    }
+
+    fn has_processes(&self) -> bool {
+        true
+    }
+
+    fn has(&self, id: &AttemptId, pid: i32) -> Option<bool> {
+        let group = self.live().get(id)?.group.clone()?;
+        Some(group.pids().contains(&pid))
+    }
+
+    fn interact<'a>(
+        &'a self,
+        id: &'a AttemptId,
+        invocation: &'a Invocation,
+        ends: Ends,
+        until: BoxFuture<'a, ()>,
+    ) -> BoxFuture<'a, Result<Ran, RuntimeError>> {
+        async move {
+            let engine = (&self.client()?, self.socket()?);
+            interact::interact(engine, &self.name(id), invocation, ends, until).await
+        }
+        .boxed()
+    }
+
+    fn attach<'a>(
+        &'a self,
+        id: &'a AttemptId,
+        output: &'a Outlet,
+    ) -> BoxFuture<'a, Result<(), RuntimeError>> {
+        async move { interact::attach(self.socket()?, &self.name(id), output).await }.boxed()
     }
 
     fn network<'a>(&'a self, launch: &'a Launch) -> BoxFuture<'a, Result<Reached, RuntimeError>> {

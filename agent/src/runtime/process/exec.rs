@@ -7,7 +7,7 @@ use std::ffi::OsString;
 use std::io;
 use std::os::fd::{AsFd, OwnedFd};
 use std::os::unix::process::ExitStatusExt;
-use std::process::Child;
+use std::process::{Child, Stdio};
 use std::time::Duration;
 
 use futures::future::BoxFuture;
@@ -19,15 +19,15 @@ use tokio::sync::oneshot;
 use super::attempt::{AttemptDir, Order};
 use super::scan;
 use crate::runtime::{Executed, KEPT_WORDS, RuntimeError};
-use crate::shim::start::{self, StartError};
+use crate::shim::start::{self, StartError, Streams};
 
 const WHAT: &str = "run a program beside a task";
 
 /// How long a program that was killed is waited for. One that the kernel itself holds up is left to it.
-const GONE_AFTER: Duration = Duration::from_secs(1);
+pub(super) const GONE_AFTER: Duration = Duration::from_secs(1);
 
 /// The thread's stack: it calls nothing deep.
-const STACK: usize = 256 << 10;
+pub(super) const STACK: usize = 256 << 10;
 
 pub(super) async fn exec(
     dir: AttemptDir,
@@ -66,7 +66,9 @@ fn run(dir: &AttemptDir, argv: &[String], cut: &OwnedFd) -> Result<Executed, Run
     // Only the reading end may refuse to wait.
     rustix::io::ioctl_fionbio(&child_output, false).map_err(|errno| failed(errno.into()))?;
     let both = (child_output.try_clone().map_err(failed)?, child_output);
-    let child = match start::spawn((&order, &variables(dir)), argv, both, true) {
+    let (stdout, stderr) = both;
+    let streams = Streams { stdin: Stdio::null(), stdout, stderr, terminal: false };
+    let child = match start::spawn((&order, &variables(dir)), argv, streams, true) {
         Ok(child) => child,
         Err(error @ StartError::Order(_)) => return Ok(Executed::NotStarted(error.to_string())),
         Err(error) => return Err(failed(io::Error::other(error.to_string()))),
@@ -77,7 +79,7 @@ fn run(dir: &AttemptDir, argv: &[String], cut: &OwnedFd) -> Result<Executed, Run
 
 /// The variables that the attempt's program was started with: those that it was given of ConfigMaps and Secrets are in no
 /// file.
-fn variables(dir: &AttemptDir) -> BTreeMap<OsString, OsString> {
+pub(super) fn variables(dir: &AttemptDir) -> BTreeMap<OsString, OsString> {
     let running = dir.running().ok().flatten().map(|running| running.process);
     running.map(scan::variables).unwrap_or_default()
 }

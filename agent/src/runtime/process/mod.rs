@@ -14,14 +14,19 @@
 //! | [`adopt`] | what became of the attempts of an earlier life of the agent |
 //! | [`scan`] | facts from `/proc` |
 //! | [`exec`] | programs beside a running attempt: its checks |
+//! | [`interact`] | the same for clients, with their input and output |
+//! | [`pty`] | terminals for them |
 
 mod adopt;
 pub(crate) mod attempt;
 mod exec;
+mod interact;
+mod pty;
 pub(crate) mod reach;
 pub(crate) mod scan;
 mod spawn;
 
+pub(crate) use interact::kill_session;
 pub(crate) use spawn::spawn_shim;
 
 use std::collections::BTreeMap;
@@ -50,6 +55,7 @@ use super::launch::{AttemptId, Launch, Limits, Used};
 use super::{Executed, Launched, LogQuery, Runtime, RuntimeError, RuntimeStatus, logs};
 use crate::clock;
 use crate::durable::FileError;
+use crate::exec::ends::{Ends, Invocation, Ran};
 use crate::given::files::Place;
 use attempt::{AttemptDir, LogBounds, Process, StopFile};
 use reach::{Ladder, Reach};
@@ -420,6 +426,24 @@ impl Runtime for ProcessRuntime {
         until: BoxFuture<'a, ()>,
     ) -> BoxFuture<'a, Result<Executed, RuntimeError>> {
         exec::exec(self.0.dir(&launch.id), argv, until).boxed()
+    }
+
+    fn has_processes(&self) -> bool {
+        true
+    }
+
+    fn has(&self, id: &AttemptId, pid: i32) -> Option<bool> {
+        Some(self.live(id)?.reach.pids().contains(&pid))
+    }
+
+    fn interact<'a>(
+        &'a self,
+        id: &'a AttemptId,
+        invocation: &'a Invocation,
+        ends: Ends,
+        until: BoxFuture<'a, ()>,
+    ) -> BoxFuture<'a, Result<Ran, RuntimeError>> {
+        interact::interact(self.0.dir(id), invocation, ends, until).boxed()
     }
 
     fn remove<'a>(&'a self, uid: &'a TaskUid) -> BoxFuture<'a, Result<(), RuntimeError>> {

@@ -77,6 +77,12 @@ pub(crate) fn tree(shim: i32, session: Option<i32>, mark: &str) -> BTreeSet<i32>
         .collect()
 }
 
+/// The living processes of the session that this process leads.
+pub(crate) fn session(leader: i32) -> BTreeSet<i32> {
+    let all = all();
+    all.iter().filter(|(_, stat)| stat.session == leader).map(|(pid, _)| *pid).collect()
+}
+
 fn marked(pid: i32, mark: &str) -> bool {
     let environ = fs::read(format!("/proc/{pid}/environ")).unwrap_or_default();
     environ.split(|byte| *byte == 0).any(|variable| variable == mark.as_bytes())

@@ -43,6 +43,7 @@ from muster.model import (
 )
 from muster.position import ClickedPoint, PositionSource, position_from_clicked_point
 from muster.scheduler import Scheduler
+from muster.sensor import Frame, Sensor, SourceState
 from muster.task import TaskInfo, container, executor, process
 
 #: What ``launch_tasks`` gives its done-callbacks, for annotations.
@@ -64,6 +65,7 @@ __all__ = [
     "ExecutorTask",
     "ExecutorTaskState",
     "Filter",
+    "Frame",
     "FrameworkError",
     "FrameworkInfo",
     "Gate",
@@ -85,6 +87,8 @@ __all__ = [
     "Result",
     "Scheduler",
     "SchedulerDriver",
+    "Sensor",
+    "SourceState",
     "TaskInfo",
     "TaskState",
     "TaskStatus",

@@ -75,6 +75,8 @@ class Calls:
         self._unsent: deque[pb.Call] = deque()
         self._unsent_bytes = 0
         self._acknowledgements: OrderedDict[str, int] = OrderedDict()
+        #: No offers are wanted; the controller forgets this with the session.
+        self._suppressed = False
         self._waiting: OrderedDict[str, _Waiting] = OrderedDict()
 
     def submit(self, call: pb.Call, read: Callable[[pb.Answer], T], *, repeatable: bool = True) -> Result[T]:
@@ -127,6 +129,8 @@ class Calls:
     def answer(self, answer: pb.Answer) -> None:
         with self._changed:
             waiting = self._waiting.pop(answer.id, None)
+            if waiting is not None and not answer.HasField("refusal") and _wish(waiting.call) == "offers":
+                self._suppressed = waiting.call.HasField("suppress")
             self._changed.notify_all()
         if waiting is None:
             return
@@ -150,6 +154,9 @@ class Calls:
         """The session stands; calls from before it are said again."""
         with self._changed:
             self._ready = True
+            if self._suppressed:
+                # Without an id: nobody waits for it.
+                self._push(pb.Call(suppress=pb.Suppress()))
             for waiting in self._waiting.values():
                 self._push(waiting.call)
 

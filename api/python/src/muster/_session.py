@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
+import uuid
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import NoReturn, Optional
@@ -49,6 +50,8 @@ class Books:
     seen: Seen = field(default_factory=Seen)
     #: Guards ``info``: framework threads move the position, the session thread writes the id.
     lock: threading.Lock = field(default_factory=threading.Lock)
+    #: By which the controller knows this run again when its first Subscribed was lost.
+    nonce: str = field(default_factory=lambda: str(uuid.uuid4()))
 
     def change(self, change: Callable[[FrameworkInfo], FrameworkInfo]) -> FrameworkInfo:
         with self.lock:
@@ -133,7 +136,7 @@ class Session:
         except ConfigError as error:  # It was good at the start; it may be just being renewed.
             raise Disconnected(str(error)) from error
         with books.lock:
-            subscribe = _wire.subscribe(books.info)
+            subscribe = _wire.subscribe(books.info, books.nonce)
         stream = Stream(target, books.calls.open(subscribe), CONNECT_SECONDS)
         with self._lock:
             self._stream = stream

@@ -83,12 +83,13 @@ def offer_filter(value: Filter) -> pb.Filter:
     )
 
 
-def subscribe(info: FrameworkInfo) -> pb.Call:
+def subscribe(info: FrameworkInfo, nonce: str) -> pb.Call:
     call = pb.Subscribe(
         name=info.name,
         namespace=info.namespace,
         framework_id=info.framework_id,
         filter=offer_filter(info.filter),
+        nonce=nonce,
     )
     if info.position is not None:
         call.position.CopyFrom(position(info.position, info.radius))

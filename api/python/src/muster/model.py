@@ -26,7 +26,7 @@ class Cost(enum.Enum):
 
     #: Metres.
     DISTANCE = 1
-    #: Seconds at the robot's speed, in a straight line.
+    #: Seconds at the robot's speed, over the floor of the map's Site, or in a straight line where it has none.
     TRAVEL_TIME = 2
 
 
@@ -46,7 +46,7 @@ class RescindReason(enum.Enum):
     SUPPRESSED = 7
     #: A closer robot takes its place.
     CLOSER = 8
-    #: The namespace has no quota left.
+    #: What the namespace's quota leaves is all used, or not any more; a fresh offer follows where something is left.
     QUOTA = 9
 
 
@@ -132,7 +132,7 @@ class Filter:
     actuators: tuple[str, ...] = ()
     #: Some free AR.
     any_actuator: bool = False
-    #: At most so many offers at once, the closest first; 0: the controller's default.
+    #: At most so many offers at once, the closest first; 0: the controller's default. No more than 1000.
     most: int = 0
 
 

@@ -83,9 +83,10 @@ impl Pending {
     }
 }
 
-/// Saying a wish or an end twice changes nothing. A launch would be there twice, and messages come at most once.
+/// Saying a wish or an end twice changes nothing. A launch would be there twice, messages come at most once, and offers end
+/// with their session: there is nothing left to decline.
 fn may_be_repeated(say: &Say) -> bool {
-    !matches!(say, Say::Accept(_) | Say::Message(_))
+    !matches!(say, Say::Accept(_) | Say::Decline(_) | Say::Message(_))
 }
 
 #[cfg(test)]
@@ -100,7 +101,11 @@ mod tests {
         assert_eq!(pending.add(Say::Accept(proto::Accept::default()), answer).id, "1");
         let (answer, mut wish) = oneshot::channel();
         pending.add(Say::Revive(proto::Revive {}), answer);
+        let (answer, mut decline) = oneshot::channel();
+        pending.add(Say::Decline(proto::Decline::default()), answer);
         pending.disconnected();
+        let refused = decline.try_recv().expect("answered").expect_err("its offers are gone");
+        assert_eq!(refused.reason, Reason::Disconnected);
         let refused = launch.try_recv().expect("answered").expect_err("refused");
         assert_eq!(refused.reason, Reason::Disconnected);
         let again = pending.again();

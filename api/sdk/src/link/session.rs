@@ -52,6 +52,8 @@ const QUEUE: usize = 32;
 const MAX_WIRE: usize = (4 << 20) + (64 << 10);
 /// A controller that is there answers a Subscribe with one write to its store.
 const SUBSCRIBED_WITHIN: Duration = Duration::from_secs(15);
+/// The reason of an error: the id is no framework's any more.
+const UNKNOWN: &str = "UnknownFramework";
 /// So many heartbeats in a row do not get lost on a connection that works.
 const MISSED_HEARTBEATS: u32 = 5;
 
@@ -68,6 +70,27 @@ pub(crate) struct Inbox {
     pub(crate) commands: mpsc::Receiver<Command>,
     pub(crate) relayed: mpsc::UnboundedReceiver<Relayed>,
     pub(crate) lanes: Lanes,
+}
+
+/// What is to be said.
+#[derive(Debug)]
+enum Wanted {
+    Command(Command),
+    Relayed(Relayed),
+}
+
+impl Inbox {
+    /// The next, as soon as it can be said at once: events are heard meanwhile, or two sides that have much to say would wait for
+    /// each other. Half of the queue is kept for what follows from events. Cancel-safe.
+    async fn next(&mut self, out: &mpsc::Sender<proto::Call>) -> Option<Wanted> {
+        // Closed: the stream says why.
+        drop(out.reserve_many(QUEUE / 2 + 1).await.ok()?);
+        tokio::select! {
+            Some(command) = self.commands.recv() => Some(Wanted::Command(command)),
+            Some(relayed) = self.relayed.recv() => Some(Wanted::Relayed(relayed)),
+            else => None,
+        }
+    }
 }
 
 impl Drop for Inbox {
@@ -133,8 +156,6 @@ pub(crate) struct Session {
     identity: Identity,
     /// No offers are wanted; the controller forgets this with the connection.
     suppressed: bool,
-    /// The id is from an earlier run, and not known to hold.
-    id_is_old: bool,
     /// This connection got as far as Subscribed.
     subscribed: bool,
     pending: Pending,
@@ -160,7 +181,6 @@ impl Session {
         stop: CancellationToken,
     ) -> Self {
         Session {
-            id_is_old: !identity.subscribe.framework_id.is_empty(),
             link,
             identity,
             suppressed: false,
@@ -233,8 +253,10 @@ impl Session {
                     }
                 }
                 // Closed: every handle is gone, and what happens is still of interest.
-                Some(command) = self.inbox.commands.recv() => self.command(command, &line).await?,
-                Some(relayed) = self.inbox.relayed.recv() => self.relay(relayed, &line).await?,
+                Some(wanted) = self.inbox.next(&line.out) => match wanted {
+                    Wanted::Command(command) => self.command(command, &line).await?,
+                    Wanted::Relayed(relayed) => self.relay(relayed, &line).await?,
+                },
                 () = tokio::time::sleep_until(deaf_at) => {
                     return Err(End::Broken(Broken::Deaf(line.deaf_after)));
                 }
@@ -262,7 +284,7 @@ impl Session {
         let (heard, first) = first.map_err(ended_by)?;
         let subscribed = match first.and_then(|event| event.event) {
             Some(Hear::Subscribed(subscribed)) => subscribed,
-            Some(Hear::Error(error)) => return Err(self.told(error)),
+            Some(Hear::Error(error)) => return Err(self.refused(error)),
             Some(_) => return Err(End::Broken(Broken::NotSubscribed)),
             None => return Err(End::Broken(Broken::Closed)),
         };
@@ -277,7 +299,6 @@ impl Session {
         let proto::Subscribed { framework_id, reregistered, .. } = subscribed;
         tracing::info!(address = %self.link.address, framework_id, reregistered, "registered");
         self.subscribed = true;
-        self.id_is_old = false;
         if self.identity.subscribe.framework_id != framework_id {
             self.identity.state.write(&framework_id).await;
             self.identity.subscribe.framework_id.clone_from(&framework_id);
@@ -291,22 +312,27 @@ impl Session {
         });
     }
 
+    /// The controller does not begin the session and says why.
+    fn refused(&mut self, error: proto::Error) -> End {
+        let is_known = !self.identity.subscribe.framework_id.is_empty();
+        match self.told(error) {
+            // Away for longer than its failover timeout: its tasks are gone, and the work is still wanted.
+            End::Final(Final::Refused(error)) if error.reason == UNKNOWN && is_known => {
+                self.identity.subscribe.framework_id.clear();
+                End::Broken(Broken::Told(error))
+            }
+            end => end,
+        }
+    }
+
     /// The controller ends the session and says why.
     fn told(&mut self, error: proto::Error) -> End {
         let proto::Error { reason, message } = error;
         let error = FrameworkError { reason, message };
         match error.reason.as_str() {
-            "UnknownFramework" if self.pending.torn_down() => End::Final(Final::TornDown),
-            // The last run's tasks are gone. This run has none yet, so it may begin anew.
-            "UnknownFramework" if self.id_is_old => {
-                self.id_is_old = false;
-                self.identity.subscribe.framework_id.clear();
-                End::Broken(Broken::Told(error))
-            }
+            UNKNOWN if self.pending.torn_down() => End::Final(Final::TornDown),
             // Coming back after Cut would throw the one out that took this one's place, and so on for ever.
-            "UnknownFramework" | "AlreadyExists" | "Invalid" | "Cut" => {
-                End::Final(Final::Refused(error))
-            }
+            UNKNOWN | "AlreadyExists" | "Invalid" | "Cut" => End::Final(Final::Refused(error)),
             _ => End::Broken(Broken::Told(error)),
         }
     }

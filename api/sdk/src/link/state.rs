@@ -1,7 +1,9 @@
 //! The file that keeps a framework's id, so that its next run comes back to its tasks.
 
 use std::io::{self, ErrorKind};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
+
+use tokio::io::AsyncWriteExt as _;
 
 use crate::ConnectError;
 
@@ -30,8 +32,13 @@ impl StateFile {
         let mut beside = path.clone().into_os_string();
         beside.push(".new");
         let written = async {
-            tokio::fs::write(&beside, format!("{id}\n")).await?;
-            tokio::fs::rename(&beside, path).await
+            let mut file = tokio::fs::File::create(&beside).await?;
+            file.write_all(format!("{id}\n").as_bytes()).await?;
+            // Before it has the name: after a power cut there would be a name and nothing in it.
+            file.sync_all().await?;
+            tokio::fs::rename(&beside, path).await?;
+            let dir = path.parent().filter(|dir| !dir.as_os_str().is_empty());
+            tokio::fs::File::open(dir.unwrap_or_else(|| Path::new("."))).await?.sync_all().await
         };
         self.warn(written.await);
     }

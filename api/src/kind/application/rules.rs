@@ -167,7 +167,7 @@ fn template_rules(part: &Part, path: &str, violations: &mut Violations) {
     let task = &part.template.spec;
     let mut of_task = Violations::new();
     task_rules::rules(task, &mut of_task);
-    violations.extend(of_task.below("spec", &format!("{path}.spec")));
+    violations.append(of_task.below("spec", &format!("{path}.spec")));
     let labels = &part.template.metadata.labels;
     check_labels(labels, &format!("{path}.metadata.labels"), violations);
     let placement = &task.placement;

@@ -8,6 +8,10 @@ use serde::{Deserialize, Serialize};
 /// Taint of a robot that is stopped, while the condition `EmergencyStop` holds.
 pub const ESTOP_TAINT: &str = "muster.dev/emergency-stop";
 
+/// Annotation of a Node: when a person last ordered a stop. A stop that is as far as the one before is written, too, so that a
+/// release which was decided before it does not count.
+pub const ORDERED: &str = "muster.dev/estop-ordered";
+
 /// How far a robot is stopped. The order is that of restriction.
 #[derive(
     Debug,

@@ -1,6 +1,7 @@
 //! Node: a robot or a cloud server that runs an agent.
 
 pub mod estop;
+pub mod image;
 pub mod upkeep;
 
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::MicroTime;
@@ -17,6 +18,7 @@ use crate::pose::Pose;
 use crate::resource::Compute;
 use crate::validate::{Violations, element_path};
 use estop::{EStopStatus, EStopTier};
+use image::ImageStatus;
 use upkeep::{Battery, MaintenanceWindow};
 
 /// What a node is.
@@ -179,6 +181,9 @@ pub struct NodeStatus {
     #[serde(skip_serializing_if = "Vec::is_empty")]
     #[schemars(extend("x-kubernetes-list-type" = "map", "x-kubernetes-list-map-keys" = ["type"]))]
     pub conditions: Vec<Condition>,
+    /// Images that rollouts want there before a task is ended for them.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub images: Vec<ImageStatus>,
     /// How tasks can be run there.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub runtimes: Vec<RuntimeStatus>,

@@ -13,8 +13,8 @@ use super::TaskSpec;
 use crate::duration::Span;
 use crate::validate::{Violations, element_path};
 
-/// A check that is made again and again while the task runs: exactly one of `exec`, `http` and `tcp`.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+/// A check that is made again and again while the task runs: exactly one of `exec`, `http`, `tcp` and `topic`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "camelCase", deny_unknown_fields)]
 pub struct Probe {
     /// A program inside the task; it succeeds when it returns 0.
@@ -26,13 +26,17 @@ pub struct Probe {
     /// A connection in the task's network; it succeeds when it is accepted.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub tcp: Option<TcpCheck>,
+    /// A ROS 1 topic that is published often enough, as the node sees it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub topic: Option<TopicCheck>,
     /// How long after the start of an attempt the first check is made.
     #[serde(default)]
     pub initial_delay: Span,
     /// From one check to the next.
     #[serde(default = "default_period")]
     pub period: Span,
-    /// After how long a check that has no answer has failed.
+    /// After how long a check that has no answer has failed. A topic's answers at once, but for the first, which takes as
+    /// long as `topic.within` when too little comes.
     #[serde(default = "default_timeout")]
     pub timeout: Span,
     /// Successes in a row until it has succeeded; other than 1 for readiness only.
@@ -106,6 +110,33 @@ pub struct TcpCheck {
     pub host: Option<String>,
 }
 
+/// Messages of a ROS 1 topic, of whatever type, counted by the node's agent as they arrive there.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "camelCase", deny_unknown_fields)]
+pub struct TopicCheck {
+    /// Its name. One that does not begin with a slash is in `ROS_NAMESPACE` of the task's environment, or else in the
+    /// agent's `--ros-namespace`.
+    pub name: String,
+    /// Messages a second at least, by the node's clock.
+    pub min_hz: f64,
+    /// Over how long they are counted.
+    #[serde(default = "default_within")]
+    pub within: Span,
+    /// The ROS master, `http://HOST:PORT`. None: `ROS_MASTER_URI` of the task's environment, or else the agent's.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub master: Option<String>,
+}
+
+/// Of a topic that says no other time.
+fn default_within() -> Span {
+    Span::from_secs(2)
+}
+
+/// A robot's agent counts for no longer than anybody waits for a readiness.
+const MAX_WITHIN: Span = Span::from_secs(600);
+/// No topic is published so often.
+const MAX_HZ: f64 = 10_000.0;
+
 fn default_period() -> Span {
     Span::from_secs(10)
 }
@@ -161,13 +192,14 @@ fn check_rules(probe: &Probe, path: &str, violations: &mut Violations) {
         ("exec", probe.exec.is_some()),
         ("http", probe.http.is_some()),
         ("tcp", probe.tcp.is_some()),
+        ("topic", probe.topic.is_some()),
     ]
     .into_iter()
     .filter_map(|(name, given)| given.then_some(name))
     .collect();
     match given.as_slice() {
         [] => {
-            violations.required(path).suggest("give `exec`, `http` or `tcp`");
+            violations.required(path).suggest("give `exec`, `http`, `tcp` or `topic`");
         }
         [_] => {}
         [first, second, ..] => {
@@ -188,6 +220,9 @@ fn check_rules(probe: &Probe, path: &str, violations: &mut Violations) {
     }
     if let Some(tcp) = &probe.tcp {
         address_rules(tcp.port, tcp.host.as_deref(), &format!("{path}.tcp"), violations);
+    }
+    if let Some(topic) = &probe.topic {
+        topic_rules(topic, &format!("{path}.topic"), violations);
     }
 }
 
@@ -215,6 +250,58 @@ fn http_rules(http: &HttpCheck, path: &str, violations: &mut Violations) {
             violations.invalid(format!("{path}.value"), reason);
         }
     }
+}
+
+fn topic_rules(topic: &TopicCheck, path: &str, violations: &mut Violations) {
+    let name = &topic.name;
+    let part = |part: &str| {
+        let mut letters = part.chars();
+        letters.next().is_some_and(|first| first.is_ascii_alphabetic() || first == '_')
+            && letters.all(|c| c.is_ascii_alphanumeric() || c == '_')
+    };
+    if !name.strip_prefix('/').unwrap_or(name).split('/').all(part) {
+        let private = name.starts_with('~');
+        let reason = format!("{name:?} is not the name of a ROS topic");
+        violations.invalid(format!("{path}.name"), reason).suggest(if private {
+            "write the node's name before it: /node/topic; here nobody knows which node is meant"
+        } else {
+            "letters, digits, _ and /, as in /scan or front/scan"
+        });
+    }
+    let within = topic.within.as_duration().as_secs_f64();
+    if !(topic.min_hz > 0.0 && topic.min_hz <= MAX_HZ) {
+        violations
+            .invalid(format!("{path}.minHz"), format!("{} is not a rate in Hz", topic.min_hz))
+            .suggest("messages a second, more than 0; try 5, somewhat below what is published");
+    } else if topic.within > MAX_WITHIN {
+        violations
+            .invalid(
+                format!("{path}.within"),
+                format!("{} is more than {MAX_WITHIN}", topic.within),
+            )
+            .suggest("leave it out for 2s");
+    } else if topic.min_hz * within < 1.0 {
+        let reason = format!("{} has no room for a message at {} Hz", topic.within, topic.min_hz);
+        let seconds = (2.0 / topic.min_hz).ceil();
+        violations.invalid(format!("{path}.within"), reason).suggest(format!("try \"{seconds}s\""));
+    }
+    if let Some(master) = topic.master.as_deref().filter(|master| !is_master(master)) {
+        violations
+            .invalid(
+                format!("{path}.master"),
+                format!("{master:?} is not the address of a ROS master"),
+            )
+            .suggest("http://HOST:PORT, as in ROS_MASTER_URI; for example http://localhost:11311");
+    }
+}
+
+fn is_master(text: &str) -> bool {
+    let rest = text.strip_prefix("http://").map(|rest| rest.strip_suffix('/').unwrap_or(rest));
+    let parts = rest.and_then(|rest| rest.rsplit_once(':'));
+    parts.is_some_and(|(host, port)| {
+        let good = |c: char| c.is_ascii_alphanumeric() || "-._[]:".contains(c);
+        !host.is_empty() && host.chars().all(good) && port.parse::<u16>().is_ok_and(|p| p > 0)
+    })
 }
 
 fn address_rules(port: u16, host: Option<&str>, path: &str, violations: &mut Violations) {

@@ -17,6 +17,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Deserializer, Serialize, de};
 
 use super::KindInfo;
+use super::node::image::ImageWish;
 use super::task::TaskSpec;
 use crate::condition::Condition;
 use crate::duration::Span;
@@ -226,6 +227,9 @@ pub struct TaskSetStatus {
     /// Tasks that a rollout is ending, to begin others in their places.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub replacing: Vec<Replacing>,
+    /// Images that a rollout wants on nodes before it ends a task there.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub image_pulls: Vec<ImagePull>,
     /// Nodes under a mission lock, where a task stays that would be changed or ended.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub held: Vec<Held>,
@@ -273,6 +277,19 @@ pub struct Replacing {
     pub node: String,
     /// Name of the revision of the one that follows.
     pub revision: String,
+}
+
+/// An image that a node is to have before its task is ended for a rollout. It is written down so that its agent is told of
+/// it, and of nothing else, by whichever controller.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "camelCase")]
+pub struct ImagePull {
+    /// Where.
+    pub node: String,
+    /// Name of the revision that needs it.
+    pub revision: String,
+    /// What is wanted.
+    pub wish: ImageWish,
 }
 
 /// A task that stays because of a mission.

@@ -90,7 +90,7 @@ fn template_rules(spec: &TaskSetSpec, violations: &mut Violations) {
     let mut of_task = Violations::new();
     // What a template says of it is refused below, whatever it says.
     task_rules::rules(&TaskSpec { reschedule: None, ..template.clone() }, &mut of_task);
-    violations.extend(of_task.below("spec", "spec.template.spec"));
+    violations.append(of_task.below("spec", "spec.template.spec"));
     if template.restart_policy != RestartPolicy::Always {
         violations
             .not_supported(

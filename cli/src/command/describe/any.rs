@@ -46,9 +46,19 @@ fn title(key: &str) -> String {
     text
 }
 
+/// Characters of a value that are shown.
+const SHOWN: usize = 400;
+
 fn text(value: &Value) -> String {
-    match value {
+    let whole = match value {
         Value::String(text) => text.clone(),
         other => other.to_string(),
+    };
+    // A site's floor is thousands of them.
+    let length = whole.chars().count();
+    if length <= SHOWN {
+        return whole;
     }
+    let shown: String = whole.chars().take(SHOWN / 4).collect();
+    format!("{shown}… ({length} characters; `muster get -o yaml` shows all)")
 }

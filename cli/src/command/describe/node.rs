@@ -2,6 +2,7 @@
 
 use jiff::Timestamp;
 use muster_api::condition::{BATTERY, ConditionStatus, READY};
+use muster_api::kind::node::image::ImagePhase;
 use muster_api::kind::node::upkeep::{MaintenanceWindow, Moment};
 use muster_api::kind::node::{Node, NodeStatus};
 use muster_api::kind::task::Task;
@@ -46,6 +47,9 @@ pub(super) fn describe(sheet: &mut Sheet, node: &Node, tasks: &[Task], now: Time
     sheet.table("Sensors (SR), shared", sensor_table(status, tasks));
     sheet.table("Actuators (AR), one holder", actuator_table(status));
     sheet.table("Runtimes", runtime_table(status));
+    if !status.images.is_empty() {
+        sheet.table("Images that rollouts want", image_table(status));
+    }
     sheet.table("Tasks", task_table(tasks));
     sheet.table("Conditions", condition_table(&status.conditions, now));
 }
@@ -191,6 +195,25 @@ fn runtime_table(status: &NodeStatus) -> Table {
             usable,
             Cell::from(&runtime.version),
             Cell::from(&runtime.message),
+        ]);
+    }
+    table
+}
+
+fn image_table(status: &NodeStatus) -> Table {
+    let mut table = Table::new(["IMAGE", "POLICY", "STATE", "FAILED", "MESSAGE"]);
+    for image in &status.images {
+        let mood = match image.phase {
+            ImagePhase::Pulled => Mood::Good,
+            ImagePhase::BackOff => Mood::Bad,
+            ImagePhase::Waiting | ImagePhase::Pulling => Mood::Plain,
+        };
+        table.push([
+            Cell::from(&image.wish.image),
+            format!("{:?}", image.wish.pull_policy).into(),
+            Cell::new(image.phase.as_str(), mood),
+            image.failures.to_string().into(),
+            Cell::from(&image.message),
         ]);
     }
     table

@@ -42,13 +42,20 @@ fn check(probe: &Probe) -> String {
         format!("gets {scheme}://{}{}", at(&http.host, http.port), http.path)
     } else if let Some(tcp) = &probe.tcp {
         format!("connects to {}", at(&tcp.host, tcp.port))
+    } else if let Some(topic) = &probe.topic {
+        let at = topic.master.as_ref().map(|master| format!(" at {master}")).unwrap_or_default();
+        let (name, hz, within) = (&topic.name, topic.min_hz, topic.within);
+        format!("counts {name}{at}: at least {hz} Hz over {within}")
     } else {
         "a check that this command does not know".to_owned()
     }
 }
 
 fn timing(probe: &Probe) -> String {
-    let mut text = format!("every {}, answer within {}", probe.period, probe.timeout);
+    let mut text = format!("every {}", probe.period);
+    if probe.topic.is_none() {
+        text.push_str(&format!(", answer within {}", probe.timeout));
+    }
     if !probe.initial_delay.as_duration().is_zero() {
         text.push_str(&format!(", first after {}", probe.initial_delay));
     }
@@ -115,6 +122,18 @@ mod tests {
         let text = fake.run(&["describe", "task/t"]).await.1;
         let probes = text.split("\nProbes\n").nth(1).expect("a section");
         probes.split("\n\n").next().expect("its lines").to_owned()
+    }
+
+    #[tokio::test]
+    async fn a_topic_is_counted_and_has_no_timeout() {
+        let fake = Fake::new();
+        let mut object = task("t", json!({"phase": "Running", "ready": true}));
+        let topic = json!({"name": "/scan", "minHz": 5.0, "master": "http://robot:11311"});
+        object["spec"]["readiness"] = json!({ "topic": topic });
+        fake.put("tasks/default/t", object);
+        let text = fake.run(&["describe", "task/t"]).await.1;
+        let line = "counts /scan at http://robot:11311: at least 5 Hz over 2s";
+        assert!(text.contains(line) && text.contains("every 10s, fails with 3 in a row"), "{text}");
     }
 
     #[tokio::test]

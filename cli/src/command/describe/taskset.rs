@@ -48,6 +48,9 @@ pub(super) fn describe(sheet: &mut Sheet, set: &TaskSet, tasks: &[Task], now: Ti
     }
     revisions(sheet, &status, now);
     sheet.table("Conditions", condition_table(&status.conditions, now));
+    if !status.image_pulls.is_empty() {
+        sheet.table("Images that come before tasks end", pulls(&status, now));
+    }
     if !status.held.is_empty() {
         sheet.table("Held by missions", held(&status));
     }
@@ -72,6 +75,20 @@ fn revisions(sheet: &mut Sheet, status: &TaskSetStatus, now: Timestamp) {
         sheet.field("Given up", Cell::new(text, Mood::Bad));
         sheet.field("", when(back.at.0, now));
     }
+}
+
+fn pulls(status: &TaskSetStatus, now: Timestamp) -> Table {
+    let mut table = Table::new(["NODE", "IMAGE", "POLICY", "WANTED"]);
+    for pull in &status.image_pulls {
+        let wish = &pull.wish;
+        table.push([
+            pull.node.clone(),
+            wish.image.clone(),
+            format!("{:?}", wish.pull_policy),
+            when(wish.since.0, now),
+        ]);
+    }
+    table
 }
 
 fn held(status: &TaskSetStatus) -> Table {

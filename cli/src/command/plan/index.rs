@@ -1,7 +1,7 @@
 //! A plan's index: a short word that is the same while the plan would do the same.
 //!
 //! It covers what would be created and changed, and what the scheduler would do about it: which task goes where with which
-//! leases, who waits, who is ended for whom. It leaves out what changes all the time and decides nothing: scores, revisions,
+//! leases, who waits, who is ended for whom, what sets do to their tasks. It leaves out what changes all the time and decides nothing: scores, revisions,
 //! the numbers in the sentences of those that wait.
 
 use ring::digest::{SHA256, digest};
@@ -19,6 +19,10 @@ pub(super) fn of(answer: &Value, requests: &[&Value]) -> String {
         every(&answer["placements"], &["namespace", "name", "node", "leases"]),
         every(&answer["waits"], &["namespace", "name"]),
         every(&answer["preemptions"], &["namespace", "name", "node", "victims"]),
+        every(
+            &answer["sets"],
+            &["namespace", "name", "begins", "later", "changes", "ends", "held"]
+        ),
     ]);
     let digest = digest(&SHA256, parts.to_string().as_bytes());
     let letters = digest.as_ref().iter().map(|byte| format!("{byte:02x}"));

@@ -2,6 +2,7 @@
 //! it knows. Exit code 0: nothing; 1: there are changes; 255: no plan could be made.
 
 mod index;
+mod sets;
 
 use std::path::PathBuf;
 
@@ -14,7 +15,7 @@ use serde_json::{Value, json};
 use super::Outcome;
 use super::apply::{self, Action, Step};
 use super::why::refusal_table;
-use crate::client::{Client, group_path};
+use crate::client::{Client, Mode, group_path};
 use crate::error::{Class, CliError, Refusal};
 use crate::exit;
 use crate::manifests::{self, Manifest};
@@ -47,6 +48,8 @@ struct Plan {
     waits: Vec<Wait>,
     #[serde(default)]
     preemptions: Vec<Preemption>,
+    #[serde(default)]
+    sets: Vec<sets::Set>,
     #[serde(default)]
     revision: String,
     /// See [`index`].
@@ -105,6 +108,20 @@ struct Preemption {
     name: String,
     node: String,
     victims: Vec<String>,
+    /// Those that pass on with their end.
+    #[serde(default)]
+    leases: Vec<String>,
+}
+
+impl Preemption {
+    /// `would end on r1: lab/x; takes over r1.body`.
+    fn text(&self) -> String {
+        let mut text = format!("would end on {}: {}", self.node, self.victims.join(", "));
+        if !self.leases.is_empty() {
+            text.push_str(&format!("; takes over {}", self.leases.join(", ")));
+        }
+        text
+    }
 }
 
 #[derive(Debug, Deserialize)]
@@ -117,10 +134,9 @@ struct Wait {
 
 pub(crate) async fn run(args: Args, session: &mut Session) -> Outcome {
     let manifests = manifests::load(&args.filename, &session.namespace, session.namespace_given)?;
-    let objects = objects(&manifests);
     let steps = apply::look_at_all(&session.client, manifests).await?;
     apply::rehearse(&session.client, &steps).await?;
-    let (answer, plan) = ask(&session.client, objects, &steps).await?;
+    let (answer, plan) = ask(&session.client, &steps).await?;
     match args.output {
         Some(format @ (Format::Yaml | Format::Json)) => {
             session.ui.print(&document(&answer, format)?)?;
@@ -134,17 +150,23 @@ pub(crate) async fn run(args: Args, session: &mut Session) -> Outcome {
     Ok(if changes { exit::FAILURE } else { exit::OK })
 }
 
-/// What the scheduler is asked about.
-fn objects(manifests: &[Manifest]) -> Vec<Value> {
-    manifests.iter().map(|m| m.admitted.clone()).collect()
+/// What the controller is asked about: manifests, and a set that is changed as it would be afterwards, with what others have
+/// set of it.
+async fn objects(client: &Client, steps: &[Step]) -> Result<Vec<Value>, CliError> {
+    let mut objects = Vec::new();
+    for step in steps {
+        let changed = matches!(step.action, Action::Patch { .. });
+        objects.push(match changed && step.manifest.info.kind == "TaskSet" {
+            true => apply::perform(client, step, Mode::DryRun).await?,
+            false => step.manifest.admitted.clone(),
+        });
+    }
+    Ok(objects)
 }
 
 /// The controller's answer with what apply would change, and the same to be looked at.
-async fn ask(
-    client: &Client,
-    objects: Vec<Value>,
-    steps: &[Step],
-) -> Result<(Value, Plan), CliError> {
+async fn ask(client: &Client, steps: &[Step]) -> Result<(Value, Plan), CliError> {
+    let objects = objects(client, steps).await?;
     let uri = group_path("plan");
     let mut answer: Value = client.post_json(&uri, &json!({ "objects": objects })).await?;
     // The controller plans placements; which fields apply would change, only apply's own rules say.
@@ -163,12 +185,15 @@ async fn ask(
     Ok((answer, plan))
 }
 
-/// Whether applying would do what a plan with this index said; if not, what it would do now.
-pub(super) async fn check(session: &Session, steps: &[Step], index: &str) -> Result<(), CliError> {
-    let objects = steps.iter().map(|step| step.manifest.admitted.clone()).collect();
-    let (_, plan) = ask(&session.client, objects, steps).await?;
+/// Whether applying would do what a plan with this index said, and as of which revision; if not, what it would do now.
+pub(super) async fn check(
+    session: &Session,
+    steps: &[Step],
+    index: &str,
+) -> Result<String, CliError> {
+    let (_, plan) = ask(&session.client, steps).await?;
     if plan.index == index {
-        return Ok(());
+        return Ok(plan.revision);
     }
     let now = render(&plan, &Styles::default());
     Err(CliError::Refused(Box::new(Refusal {
@@ -223,8 +248,10 @@ fn render(plan: &Plan, styles: &Styles) -> String {
         }
         let mut rooms = plan.preemptions.iter();
         if let Some(room) = rooms.find(|p| is_it(&p.namespace, &p.name) && !p.victims.is_empty()) {
-            let line = format!("would end on {}: {}", room.node, room.victims.join(", "));
-            text.push_str(&format!("    {}\n", styles.bad.paint(line)));
+            text.push_str(&format!("    {}\n", styles.bad.paint(room.text())));
+        }
+        if change.kind == "TaskSet" {
+            text.push_str(&sets::render(plan, change, styles));
         }
         if let Some(wait) = plan.waits.iter().find(|w| is_it(&w.namespace, &w.name)) {
             text.push_str(&format!("    {}\n", styles.warn.paint("would wait:")));

@@ -163,11 +163,15 @@ fn refuses(why: &[NodeRefusal], words: &[&str]) -> bool {
 
 /// Commands that help with the filters that refuse. `reach`: the field that says how far a robot may be.
 fn advice(why: &[NodeRefusal], reach: &str) -> Vec<String> {
-    let known: [(&[&str], String); 7] = [
+    let known: [(&[&str], String); 8] = [
         (
             &["ConfigMapNotFound", "ConfigMapKeyNotFound", "SecretNotFound", "SecretKeyNotFound"],
             "`muster create configmap` or `muster create secret` makes it; the task is placed at once then"
                 .into(),
+        ),
+        (
+            &["Unreachable"],
+            "`muster get sites` shows the maps whose walls count; a new map is applied to its Site".into(),
         ),
         (
             &["LeaseHeld"],

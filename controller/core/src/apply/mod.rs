@@ -40,6 +40,9 @@ pub struct Manager {
     pub operation: Operation,
     /// Empty, or the subresource that it wrote through.
     pub subresource: String,
+    /// The group and version that it wrote. Who applies a view of a kind says nothing of what the view does not show: it is
+    /// another manager than the one of its name that applies the kind itself.
+    pub version: String,
 }
 
 /// What a manager owns.
@@ -107,7 +110,7 @@ pub fn apply(
     let before = owners.remove(manager);
     if let Some(before) = &before {
         let kept = |path: &Path| {
-            let holds = |fields: &Fields| fields.iter().any(|owned| owned.starts_with(path));
+            let holds = |fields: &Fields| path::leads_into(path, fields.range(path..));
             holds(&said_fields) || owners.values().any(|owned| holds(&owned.fields))
         };
         let gone: Vec<&Path> = before.fields.iter().filter(|path| !kept(path)).collect();
@@ -165,7 +168,7 @@ pub fn update(
         let count = owned.fields.len();
         owned.fields.retain(|path| {
             // Membership of a list goes with its element; a map that was empty may have got members.
-            let there = after.contains_key(path) || after.keys().any(|p| p.starts_with(path));
+            let there = path::leads_into(path, after.range(path..).map(|(path, _)| path));
             there && (other == manager || !changed.contains(path))
         });
         if owned.fields.len() != count {

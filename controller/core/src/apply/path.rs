@@ -82,6 +82,12 @@ impl Path {
     }
 }
 
+/// Whether `path`, or one that it leads into, is among these, which are those from `path` on in order: what it leads into
+/// follows it at once.
+pub(super) fn leads_into<'a>(path: &Path, mut from: impl Iterator<Item = &'a Path>) -> bool {
+    from.next().is_some_and(|next| next.starts_with(path))
+}
+
 /// As Kubernetes writes it in conflicts: `.spec.env[name="A"].value`.
 impl fmt::Display for Path {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {

@@ -134,9 +134,10 @@ pub fn merge(schema: &Value, live: &Value, config: &Value) -> Value {
         }
         (Shape::Keyed(keys, items), Shape::Keyed(..), Value::Array(live), Value::Array(config)) => {
             let mut merged = live.clone();
+            let places = places(&keys, live);
             for said in config {
-                let wanted = step(&keys, said);
-                match merged.iter_mut().find(|present| step(&keys, present) == wanted) {
+                let place = places.get(&step(&keys, said));
+                match place.and_then(|place| merged.get_mut(*place)) {
                     Some(present) => *present = merge(items, present, said),
                     None => merged.push(merge(items, &Value::Null, said)),
                 }
@@ -144,9 +145,9 @@ pub fn merge(schema: &Value, live: &Value, config: &Value) -> Value {
             Value::Array(merged)
         }
         (Shape::Set, Shape::Set, Value::Array(live), Value::Array(config)) => {
-            let mut merged = live.clone();
-            merged.extend(config.iter().filter(|said| !live.contains(said)).cloned());
-            Value::Array(merged)
+            let present: BTreeSet<String> = live.iter().map(ToString::to_string).collect();
+            let new = config.iter().filter(|said| !present.contains(&said.to_string()));
+            Value::Array(live.iter().chain(new).cloned().collect())
         }
         // Nothing there yet: without the nulls that may be inside.
         (_, Shape::Fields(_), _, Value::Object(_)) => {
@@ -156,43 +157,61 @@ pub fn merge(schema: &Value, live: &Value, config: &Value) -> Value {
     }
 }
 
+/// Where the elements of a list with keys are.
+fn places(keys: &[&str], elements: &[Value]) -> BTreeMap<Step, usize> {
+    elements.iter().enumerate().map(|(place, element)| (step(keys, element), place)).collect()
+}
+
 /// Takes fields and elements out of a value, and what is empty after that.
 pub fn remove(schema: &Value, value: &mut Value, paths: &[&Path]) {
-    for path in paths {
-        take(without_null(schema), value, path.steps());
+    let steps: Vec<&[Step]> = paths.iter().map(|path| path.steps()).collect();
+    take(without_null(schema), value, &steps);
+}
+
+/// The same at one place of the value; the paths from there on, all at once.
+fn take(schema: &Value, value: &mut Value, paths: &[&[Step]]) {
+    let mut below: BTreeMap<&Step, Vec<&[Step]>> = BTreeMap::new();
+    for (first, rest) in paths.iter().filter_map(|path| path.split_first()) {
+        below.entry(first).or_default().push(rest);
+    }
+    let shape = shape(schema, value);
+    match value {
+        Value::Object(members) => {
+            for (first, rests) in below {
+                let Step::Field(name) = first else { continue };
+                let Some(member) = members.get_mut(name) else { continue };
+                take(field(schema, name), member, &rests);
+                if rests.iter().any(|rest| rest.is_empty()) || is_empty(member) {
+                    members.remove(name);
+                }
+            }
+        }
+        Value::Array(elements) => match shape {
+            Shape::Keyed(keys, items) => take_elements(items, &keys, elements, &below),
+            _ => {
+                elements.retain(|element| !below.contains_key(&Step::Element(element.to_string())))
+            }
+        },
+        _ => {}
     }
 }
 
-fn take(schema: &Value, value: &mut Value, steps: &[Step]) {
-    let Some((first, rest)) = steps.split_first() else { return };
-    let keys = match shape(schema, value) {
-        Shape::Keyed(keys, _) => keys,
-        _ => Vec::new(),
-    };
-    match (first, value) {
-        (Step::Field(name), Value::Object(members)) => {
-            let Some(member) = members.get_mut(name) else { return };
-            take(field(schema, name), member, rest);
-            if rest.is_empty() || is_empty(member) {
-                members.remove(name);
-            }
-        }
-        (Step::Key(_), Value::Array(elements)) => {
-            let found = elements.iter().position(|element| step(&keys, element) == *first);
-            let Some(index) = found else { return };
-            // Without its key fields nobody would find the element again.
-            let is_key = matches!(rest, [Step::Field(name)] if keys.iter().any(|key| *key == name));
-            if rest.is_empty() {
-                elements.remove(index);
-            } else if let Some(element) = elements.get_mut(index).filter(|_| !is_key) {
-                take(without_null(schema.get("items").unwrap_or(NO_SCHEMA)), element, rest);
-            }
-        }
-        (Step::Element(_), Value::Array(elements)) => {
-            elements.retain(|element| Step::Element(element.to_string()) != *first);
-        }
-        _ => {}
-    }
+fn take_elements(
+    items: &Value,
+    keys: &[&str],
+    elements: &mut Vec<Value>,
+    below: &BTreeMap<&Step, Vec<&[Step]>>,
+) {
+    elements.retain_mut(|element| {
+        let Some(rests) = below.get(&step(keys, element)) else { return true };
+        // Without its key fields nobody would find the element again.
+        let is_key = |rest: &&[Step]| {
+            matches!(rest, [Step::Field(name)] if keys.iter().any(|key| *key == name))
+        };
+        let rests: Vec<&[Step]> = rests.iter().copied().filter(|rest| !is_key(rest)).collect();
+        take(items, element, &rests);
+        rests.iter().all(|rest| !rest.is_empty())
+    });
 }
 
 fn is_empty(value: &Value) -> bool {

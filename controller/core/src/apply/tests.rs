@@ -18,7 +18,7 @@ fn schema() -> Value {
 }
 
 fn manager(name: &str, operation: Operation) -> Manager {
-    Manager { name: name.into(), operation, subresource: String::new() }
+    Manager { name: name.into(), operation, subresource: String::new(), version: "v1".into() }
 }
 
 fn applied(
@@ -180,4 +180,25 @@ fn what_was_there_before_is_one_managers() {
     let conflicts = applied(&live, &owners, "kubectl", &json!({"spec": {"replicas": 2}}), false)
         .expect_err("held");
     assert_eq!(conflicts[0].manager.name, "before-first-apply");
+}
+
+#[test]
+fn long_lists_take_no_longer_than_their_length() {
+    // Compared pairwise, these would take minutes.
+    const LONG: usize = 20_000;
+    let object = |from: usize| {
+        let env: Vec<Value> = (from..from + LONG)
+            .map(|n| json!({"name": format!("N{n}"), "value": n.to_string()}))
+            .collect();
+        let sensors: Vec<String> = (from..from + LONG).map(|n| format!("s:{n}")).collect();
+        json!({"spec": {"env": env, "sensors": sensors}})
+    };
+    let (live, owners) = applied(&json!({}), &Owners::new(), "one", &object(0), false).unwrap();
+    let (live, owners) = applied(&live, &owners, "two", &object(LONG / 2), false).unwrap();
+    assert_eq!(live["spec"]["env"].as_array().map(Vec::len), Some(LONG * 3 / 2));
+    let (live, owners) = applied(&live, &owners, "one", &json!({}), false).unwrap();
+    assert_eq!(live, object(LONG / 2), "what another has as well stays");
+    let scaler = manager("scale", Operation::Update);
+    let owners = update(&schema(), &live, &object(LONG), &owners, (&scaler, "later"));
+    assert!(owners.contains_key(&scaler));
 }

@@ -11,9 +11,11 @@ use muster_api::kind::task::{Cost, NodeChoice};
 
 use super::Wish;
 use crate::cluster::{Cluster, Member, NodeFacts};
+use crate::fairness::Spent;
 use crate::report::Refusal;
 use crate::schedule::filter;
 use crate::schedule::score::score_at;
+use crate::site::Sites;
 use crate::space::Slot;
 
 /// A node that a framework may be offered.
@@ -28,7 +30,7 @@ pub struct Candidate {
 /// Chooses what a framework is shown.
 pub trait Allocator: fmt::Debug + Send + Sync {
     /// The best robots and the best cloud nodes for `wish`, at most its limit of each, best first, robots before cloud
-    /// nodes, without those that `refused` names. Every one passes [`refusal`].
+    /// nodes, without those that `refused` names. Every one passes [`refusal`], and is not [`is_spent`].
     fn candidates(
         &self,
         cluster: &Cluster,
@@ -50,7 +52,10 @@ impl Allocator for Closest {
     ) -> Vec<Candidate> {
         let limit = wish.filter.limit();
         let fits = |c: &Candidate| {
-            holdings_refusal(cluster.at(c.slot), wish).is_none() && !refused(c.slot, c.score)
+            let member = cluster.at(c.slot);
+            holdings_refusal(member, wish).is_none()
+                && !is_spent(member, wish)
+                && !refused(c.slot, c.score)
         };
         let mut found = Vec::new();
         if wish.filter.on != NodeChoice::Cloud {
@@ -64,7 +69,8 @@ impl Allocator for Closest {
                 (Some(_), Cost::TravelTime) => {
                     let mut timed: Vec<Candidate> = in_range(cluster, wish)
                         .filter_map(|c| {
-                            let score = score(cluster.at(c.slot).facts.as_ref()?, wish)?;
+                            let facts = cluster.at(c.slot).facts.as_ref()?;
+                            let score = score(cluster.sites(), facts, wish)?;
                             Some(Candidate { score: Some(score), ..c })
                         })
                         .filter(fits)
@@ -99,21 +105,39 @@ fn in_range<'a>(cluster: &'a Cluster, wish: &Wish) -> impl Iterator<Item = Candi
 
 /// The score of a robot for a framework: metres or seconds to the operation position. None: nothing to score by.
 #[must_use]
-pub fn score(facts: &NodeFacts, wish: &Wish) -> Option<f64> {
-    score_at(facts, wish.position.as_ref(), wish.cost)
+pub fn score(sites: &Sites, facts: &NodeFacts, wish: &Wish) -> Option<f64> {
+    score_at(sites, facts, wish.position.as_ref(), wish.cost)
 }
 
 /// Why a node is not offered to a framework; none: it can be.
 #[must_use]
-pub fn refusal(member: &Member, wish: &Wish) -> Option<Refusal> {
-    reach_refusal(member, wish).or_else(|| holdings_refusal(member, wish))
+pub fn refusal(sites: &Sites, member: &Member, wish: &Wish) -> Option<Refusal> {
+    reach_refusal(sites, member, wish).or_else(|| holdings_refusal(member, wish))
+}
+
+/// Whether what the framework could want of the node is what its namespace's quota leaves nothing of.
+#[must_use]
+pub fn is_spent(member: &Member, wish: &Wish) -> bool {
+    let (spent, filter) = (wish.spent, &wish.filter);
+    if spent == Spent::default() {
+        return false;
+    }
+    let drives = filter.any_actuator || !filter.actuators.is_empty();
+    let wanted = (spent.leases && drives)
+        || (spent.cpu && filter.minimum.cpu.0 > 0)
+        || (spent.memory && filter.minimum.memory.0 > 0);
+    let (cpu, _) = member.ledger.open_cpu_memory();
+    let computes = cpu.0 > 0 && !spent.cpu;
+    let senses = member.facts.as_ref().is_some_and(|facts| !facts.sensors.is_empty());
+    let acts = actuators_free(member) && !spent.leases;
+    spent.tasks || wanted || !(computes || senses || acts)
 }
 
 /// The range filter. Cloud nodes have no pose; it does not apply to them.
 #[must_use]
-pub fn reach_refusal(member: &Member, wish: &Wish) -> Option<Refusal> {
+pub fn reach_refusal(sites: &Sites, member: &Member, wish: &Wish) -> Option<Refusal> {
     let facts = member.facts.as_ref()?;
-    filter::reach_of(facts, wish.position.as_ref(), wish.radius, wish.cost)
+    filter::reach_of(sites, facts, (wish.position.as_ref(), wish.radius, wish.cost))
 }
 
 /// Everything but the range: what the node is, whether it takes work, what is left of it.

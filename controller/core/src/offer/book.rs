@@ -8,14 +8,14 @@ use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::Arc;
 use std::time::Duration;
 
-use muster_api::resource::Compute;
-
 use super::allocator::{self, Allocator, Candidate};
+use super::refused::{Refused, is_closer};
 use super::{
-    EXPIRE_AFTER, IN_FLIGHT, Notice, Offer, OfferId, REFUSED_BY_SILENCE, Rescinded, Seat, Wish,
+    COURTESY, EXPIRE_AFTER, IN_FLIGHT, Notice, Offer, OfferId, REFUSED_BY_SILENCE, Rescinded, Seat,
+    Wish,
 };
 use crate::cluster::{Cluster, Member};
-use crate::fairness::Accounts;
+use crate::fairness::Spent;
 use crate::node_health::Monotonic;
 use crate::report::Refusal;
 use crate::space::Slot;
@@ -23,11 +23,6 @@ use crate::space::Slot;
 /// Above this many pairs of a touched node and a framework, every framework is looked at: the looks cost less than
 /// finding out who need not be.
 const LOOK_AT_ALL_ABOVE: usize = 50_000;
-
-/// An offered robot gives its place to one that is closer by this part of its own score …
-const CLOSER_BY: f64 = 0.1;
-/// … and by at least so much (metres or seconds): two robots that pass each other must not take turns.
-const CLOSER_BY_AT_LEAST: f64 = 0.5;
 
 /// One framework in the book.
 #[derive(Debug)]
@@ -37,42 +32,12 @@ pub(super) struct Place {
     pub(super) suppressed: bool,
     pub(super) offers: BTreeMap<Slot, Offer>,
     pub(super) refused: HashMap<Slot, Refused>,
+    /// It lost a race, and has not been waited for in vain since.
+    pub(super) behind: bool,
+    /// It let a [`super::courtesy`] pass without a word: declared tasks leave nothing to it until then.
+    pub(super) silent_until: Monotonic,
     /// The wish is new since the last look.
     rewished: bool,
-}
-
-/// What a framework does not want to see again for a while.
-#[derive(Debug, Clone)]
-pub(super) struct Refused {
-    pub(super) until: Monotonic,
-    free: Compute,
-    actuators_free: bool,
-    facts_version: u64,
-    score: Option<f64>,
-}
-
-impl Refused {
-    fn new(member: &Member, score: Option<f64>, until: Monotonic) -> Self {
-        Refused {
-            until,
-            free: member.ledger.open(),
-            actuators_free: allocator::actuators_free(member),
-            facts_version: member.facts_version,
-            score,
-        }
-    }
-
-    /// What was refused has changed: there is more of something now, or it is closer.
-    fn has_gained(&self, member: &Member, score: Option<f64>) -> bool {
-        self.facts_version != member.facts_version
-            || (allocator::actuators_free(member) && !self.actuators_free)
-            || self.free.shortage_for(&member.ledger.open()).is_some()
-            || matches!((self.score, score), (Some(then), Some(now)) if is_closer(now, then))
-    }
-}
-
-fn is_closer(new: f64, old: f64) -> bool {
-    new + (old * CLOSER_BY).max(CLOSER_BY_AT_LEAST) < old
 }
 
 /// Every framework, and what it is shown.
@@ -90,15 +55,17 @@ pub struct Book {
     landings: BTreeSet<(Monotonic, OfferId)>,
     pub(super) dirty: BTreeSet<Seat>,
     notices: BTreeMap<Seat, Notice>,
-    pub(super) gathered: Vec<(Monotonic, super::settle::Order)>,
-    next_offer: u64,
+    pub(super) gathered: Vec<super::settle::Window>,
+    /// Nodes that were freed lately, or that gathered Accepts are about.
+    pub(super) courtesies: BTreeMap<Slot, super::courtesy::Courtesy>,
+    next_offer: OfferId,
     next_seat: u32,
 }
 
 impl Book {
-    /// Nobody is registered.
+    /// Nobody is registered; the first offer has the number `first`.
     #[must_use]
-    pub fn new(allocator: Box<dyn Allocator>) -> Self {
+    pub fn new(allocator: Box<dyn Allocator>, first: OfferId) -> Self {
         Book {
             allocator,
             places: BTreeMap::new(),
@@ -111,9 +78,16 @@ impl Book {
             dirty: BTreeSet::new(),
             notices: BTreeMap::new(),
             gathered: Vec::new(),
-            next_offer: 1,
+            courtesies: BTreeMap::new(),
+            next_offer: first,
             next_seat: 1,
         }
+    }
+
+    /// The number of the next offer: a book that takes this one's place begins there.
+    #[must_use]
+    pub fn next_offer(&self) -> OfferId {
+        self.next_offer
     }
 
     /// A framework subscribes; it is connected from now on.
@@ -126,6 +100,8 @@ impl Book {
             suppressed: false,
             offers: BTreeMap::new(),
             refused: HashMap::new(),
+            behind: false,
+            silent_until: Monotonic::ZERO,
             rewished: false,
         };
         self.places.insert(seat, place);
@@ -136,7 +112,8 @@ impl Book {
     /// The framework's session ended: what it was offered is offered no more. It may come back by [`Book::reconnect`].
     pub fn disconnect(&mut self, seat: Seat) {
         if let Some(place) = self.places.get_mut(&seat) {
-            place.connected = false;
+            (place.connected, place.behind) = (false, false);
+            self.is_awaited_no_more(seat);
             self.withdraw_all(seat, Rescinded::Suppressed);
             self.notices.remove(&seat);
         }
@@ -148,6 +125,7 @@ impl Book {
         if let Some(place) = self.places.get_mut(&seat) {
             place.connected = true;
             place.suppressed = false;
+            place.silent_until = Monotonic::ZERO;
             place.wish = wish;
             self.forget_refusals(seat);
             self.dirty.insert(seat);
@@ -160,7 +138,9 @@ impl Book {
         self.forget_refusals(seat);
         self.places.remove(&seat);
         self.dirty.remove(&seat);
-        self.gathered.retain(|(_, order)| order.seat != seat);
+        for window in &mut self.gathered {
+            window.orders.retain(|gathered| gathered.order.seat != seat);
+        }
     }
 
     /// SetPosition and SetFilter: everything is looked at anew, what was declined too.
@@ -168,6 +148,7 @@ impl Book {
         if let Some(place) = self.places.get_mut(&seat) {
             place.wish = wish;
             place.rewished = true;
+            place.silent_until = Monotonic::ZERO;
             self.forget_refusals(seat);
             self.dirty.insert(seat);
         }
@@ -182,7 +163,8 @@ impl Book {
     /// No offers until [`Book::revive`].
     pub fn suppress(&mut self, seat: Seat) {
         if let Some(place) = self.places.get_mut(&seat) {
-            place.suppressed = true;
+            (place.suppressed, place.behind) = (true, false);
+            self.is_awaited_no_more(seat);
             self.withdraw_all(seat, Rescinded::Suppressed);
         }
     }
@@ -191,6 +173,7 @@ impl Book {
     pub fn revive(&mut self, seat: Seat) {
         if let Some(place) = self.places.get_mut(&seat) {
             place.suppressed = false;
+            place.silent_until = Monotonic::ZERO;
             self.forget_refusals(seat);
             self.dirty.insert(seat);
         }
@@ -211,6 +194,8 @@ impl Book {
         offers: &[OfferId],
         (refuse, now): (Duration, Monotonic),
     ) -> Vec<OfferId> {
+        let slots = offers.iter().filter_map(|id| self.find(seat, *id)).map(|(slot, _)| slot);
+        self.has_answered(seat, &slots.collect());
         let mut unknown = Vec::new();
         for id in offers {
             match self.offers.get(id) {
@@ -239,6 +224,24 @@ impl Book {
         self.dirty.insert(seat);
     }
 
+    /// An Accept of an offer that had ended while it was on its way was granted: the offer is good for no other one.
+    pub(super) fn landed(
+        &mut self,
+        cluster: &Cluster,
+        id: OfferId,
+        (refuse, now): (Duration, Monotonic),
+    ) {
+        let Some((seat, slot)) = self.in_flight.remove(&id) else { return };
+        if !refuse.is_zero() {
+            let wish = self.wish(seat);
+            let score = wish.and_then(|wish| score_of(cluster, cluster.at(slot), wish));
+            self.refuse(cluster, seat, (slot, score), now.saturating_add(refuse));
+            // One that was made meanwhile shows what is refused now.
+            self.withdraw(seat, slot, Rescinded::Taken, now);
+            self.dirty.insert(seat);
+        }
+    }
+
     fn refuse(
         &mut self,
         cluster: &Cluster,
@@ -246,8 +249,12 @@ impl Book {
         (slot, score): (Slot, Option<f64>),
         until: Monotonic,
     ) {
+        self.put_refusal(seat, slot, Refused::new(cluster.at(slot), score, until));
+    }
+
+    pub(super) fn put_refusal(&mut self, seat: Seat, slot: Slot, refused: Refused) {
         let Some(place) = self.places.get_mut(&seat) else { return };
-        let refused = Refused::new(cluster.at(slot), score, until);
+        let until = refused.until;
         if let Some(earlier) = place.refused.insert(slot, refused) {
             self.thaws.remove(&(earlier.until, seat, slot));
         }
@@ -269,17 +276,21 @@ impl Book {
     /// Takes in what changed in the cluster and what ran out, and says what each framework is to be told.
     #[must_use = "a framework is told once"]
     pub fn refresh(&mut self, cluster: &mut Cluster, now: Monotonic) -> BTreeMap<Seat, Notice> {
-        let (changed, moved) = cluster.take_changes();
-        self.mark(cluster, &changed, &moved);
-        self.run_out(cluster, now);
-        let dirty = std::mem::take(&mut self.dirty);
-        let accounts = (cluster.has_quotas() && !dirty.is_empty()).then(|| Accounts::of(cluster));
-        for seat in dirty {
-            self.look(cluster, seat, accounts.as_ref(), now);
-        }
+        self.take_in(cluster, now);
         let mut notices = std::mem::take(&mut self.notices);
         notices.retain(|_, notice| !notice.is_empty());
         notices
+    }
+
+    /// Looks at everybody whom changes or what ran out concern; the notices wait for [`Book::refresh`].
+    pub(super) fn take_in(&mut self, cluster: &mut Cluster, now: Monotonic) {
+        let (changed, moved) = cluster.take_changes();
+        self.mark(cluster, &changed, &moved);
+        self.run_out(cluster, now);
+        self.mark_spent(cluster, !changed.is_empty());
+        for seat in std::mem::take(&mut self.dirty) {
+            self.look(cluster, seat, now);
+        }
     }
 
     /// Marks the frameworks that changes of nodes may concern.
@@ -288,20 +299,37 @@ impl Book {
         if touched == 0 || self.places.is_empty() {
             return;
         }
-        // What a node frees may free a quota.
-        if touched * self.places.len() > LOOK_AT_ALL_ABOVE
-            || (cluster.has_quotas() && !changed.is_empty())
-        {
+        if touched * self.places.len() > LOOK_AT_ALL_ABOVE {
             return self.look_at_all();
         }
         for slot in changed.union(moved) {
             let member = cluster.at(*slot);
             for (seat, place) in &self.places {
                 if place.offers.contains_key(slot)
-                    || allocator::reach_refusal(member, &place.wish).is_none()
+                    || allocator::reach_refusal(cluster.sites(), member, &place.wish).is_none()
                 {
                     self.dirty.insert(*seat);
                 }
+            }
+        }
+    }
+
+    /// Marks the frameworks whose quota leaves nothing of something, or something again. What a node frees may free a quota.
+    fn mark_spent(&mut self, cluster: &Cluster, is_anything_changed: bool) {
+        if !is_anything_changed && self.dirty.is_empty() {
+            return;
+        }
+        let limited = cluster.has_quotas()
+            && self.places.values().any(|place| cluster.quota(&place.wish.namespace).is_some());
+        // Without a quota nothing is; who had one is dirty since it went.
+        let spent = |namespace: &str| {
+            if limited { cluster.accounts().spent(cluster, namespace) } else { Spent::default() }
+        };
+        for (seat, place) in &mut self.places {
+            let now = spent(&place.wish.namespace);
+            if place.wish.spent != now {
+                place.wish.spent = now;
+                self.dirty.insert(*seat);
             }
         }
     }
@@ -325,24 +353,28 @@ impl Book {
         }
         while let Some(&(at, id)) = self.landings.first().filter(|(at, _)| *at <= now) {
             self.landings.remove(&(at, id));
-            self.in_flight.remove(&id);
+            if self.in_flight.contains_key(&id) && self.is_named(id) {
+                // It came in time, and waits for its window.
+                self.landings.insert((now + COURTESY, id));
+            } else {
+                self.in_flight.remove(&id);
+            }
         }
     }
 
     /// Compares what a framework holds with what it can be offered.
-    fn look(&mut self, cluster: &Cluster, seat: Seat, accounts: Option<&Accounts>, now: Monotonic) {
+    fn look(&mut self, cluster: &Cluster, seat: Seat, now: Monotonic) {
         let Some(place) = self.places.get_mut(&seat) else { return };
         if !place.connected || place.suppressed {
             return;
         }
         let rewished = std::mem::take(&mut place.rewished);
-        if accounts.is_some_and(|a| a.is_exhausted(cluster, &place.wish.namespace)) {
-            return self.withdraw_all(seat, Rescinded::Quota);
-        }
         let ended: Vec<(Slot, Rescinded)> = place
             .offers
             .values()
-            .filter_map(|o| Some((o.slot, end_of(cluster.at(o.slot), &place.wish, o, rewished)?)))
+            .filter_map(|o| {
+                Some((o.slot, end_of(cluster, cluster.at(o.slot), (&place.wish, rewished), o)?))
+            })
             .collect();
         for (slot, why) in ended {
             self.withdraw(seat, slot, why, now);
@@ -387,11 +419,12 @@ impl Book {
         }
         // The present score counts: a held robot may have moved since it was offered.
         let wish = self.places[&seat].wish.clone();
-        let score_now = |slot: Slot| allocator::score(cluster.at(slot).facts.as_ref()?, &wish);
+        let score_now = |slot: Slot| score_of(cluster, cluster.at(slot), &wish);
         let mut leaving: Vec<(f64, Slot)> = held
             .iter()
             .filter(|o| !wanted.iter().any(|c| c.slot == o.slot))
-            .filter_map(|o| Some((score_now(o.slot)?, o.slot)))
+            // Without a score it is as good as any, and goes first where there are too many.
+            .map(|o| (score_now(o.slot).unwrap_or(f64::INFINITY), o.slot))
             .collect();
         leaving.sort_by(|a, b| b.0.total_cmp(&a.0).then(b.1.cmp(&a.1)));
         let over = held.len().saturating_sub(limit);
@@ -411,11 +444,11 @@ impl Book {
 
     fn offer(&mut self, cluster: &Cluster, seat: Seat, candidate: Candidate, now: Monotonic) {
         let Some(place) = self.places.get_mut(&seat) else { return };
-        let id = OfferId(self.next_offer);
-        self.next_offer += 1;
+        let id = self.next_offer;
+        self.next_offer = id.next();
         let Candidate { slot, score } = candidate;
         let version = cluster.at(slot).version;
-        let offer = Offer { id, slot, score, made_at: now, version };
+        let offer = Offer { id, slot, score, made_at: now, version, spent: place.wish.spent };
         place.offers.insert(slot, offer);
         if let Some(refused) = place.refused.remove(&slot) {
             self.thaws.remove(&(refused.until, seat, slot));
@@ -442,7 +475,10 @@ impl Book {
     /// Ends an offer, and tells the framework why.
     pub(super) fn withdraw(&mut self, seat: Seat, slot: Slot, why: Rescinded, now: Monotonic) {
         let Some(offer) = self.take_out(seat, slot) else { return };
-        if matches!(why, Rescinded::Changed | Rescinded::Closer | Rescinded::Expired) {
+        if matches!(
+            why,
+            Rescinded::Changed | Rescinded::Closer | Rescinded::Expired | Rescinded::Quota
+        ) {
             self.in_flight.insert(offer.id, (seat, slot));
             self.landings.insert((now + IN_FLIGHT, offer.id));
         }
@@ -475,8 +511,20 @@ impl Book {
 
     /// Whether a framework of another namespace is shown the node as well.
     pub(super) fn is_contested(&self, slot: Slot, namespace: &Arc<str>) -> bool {
-        let seats = self.shown.get(&slot).into_iter().flatten();
-        seats.filter_map(|s| self.places.get(s)).any(|p| p.wish.namespace != *namespace)
+        self.seats_shown(slot)
+            .filter_map(|s| self.places.get(&s))
+            .any(|p| p.wish.namespace != *namespace)
+    }
+
+    /// The frameworks that are shown the node.
+    pub(super) fn seats_shown(&self, slot: Slot) -> impl Iterator<Item = Seat> {
+        self.shown.get(&slot).into_iter().flatten().copied()
+    }
+
+    /// How many frameworks are shown the node.
+    #[must_use]
+    pub fn shown_to(&self, slot: Slot) -> usize {
+        self.shown.get(&slot).map_or(0, BTreeSet::len)
     }
 
     /// The offers that a framework holds, by node.
@@ -489,14 +537,18 @@ impl Book {
     pub fn next_deadline(&self) -> Option<Monotonic> {
         let expiry = self.expiries.first().map(|(at, _)| *at);
         let thaw = self.thaws.first().map(|(at, ..)| *at);
-        let gathered = self.gathered.first().map(|(at, _)| *at);
-        [expiry, thaw, gathered].into_iter().flatten().min()
+        [expiry, thaw, self.next_look(), self.next_end()].into_iter().flatten().min()
     }
 }
 
 /// Why an offer that is out must end; none: it stays.
-fn end_of(member: &Member, wish: &Wish, offer: &Offer, rewished: bool) -> Option<Rescinded> {
-    if allocator::reach_refusal(member, wish).is_some() {
+fn end_of(
+    cluster: &Cluster,
+    member: &Member,
+    (wish, rewished): (&Wish, bool),
+    offer: &Offer,
+) -> Option<Rescinded> {
+    if allocator::reach_refusal(cluster.sites(), member, wish).is_some() {
         return Some(if rewished { Rescinded::Filtered } else { Rescinded::OutOfRange });
     }
     match allocator::holdings_refusal(member, wish) {
@@ -505,12 +557,17 @@ fn end_of(member: &Member, wish: &Wish, offer: &Offer, rewished: bool) -> Option
         }
         Some(_) if rewished => Some(Rescinded::Filtered),
         Some(_) => Some(Rescinded::Changed),
+        None if offer.spent != wish.spent || allocator::is_spent(member, wish) => {
+            Some(Rescinded::Quota)
+        }
         // Its score is that of the old position.
-        None if rewished && score_of(member, wish) != offer.score => Some(Rescinded::Filtered),
+        None if rewished && score_of(cluster, member, wish) != offer.score => {
+            Some(Rescinded::Filtered)
+        }
         None => (member.version != offer.version).then_some(Rescinded::Changed),
     }
 }
 
-fn score_of(member: &Member, wish: &Wish) -> Option<f64> {
-    allocator::score(member.facts.as_ref()?, wish)
+fn score_of(cluster: &Cluster, member: &Member, wish: &Wish) -> Option<f64> {
+    allocator::score(cluster.sites(), member.facts.as_ref()?, wish)
 }

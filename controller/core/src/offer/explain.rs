@@ -8,7 +8,6 @@ use muster_api::name::NodeName;
 use super::book::Book;
 use super::{Seat, allocator};
 use crate::cluster::{Cluster, Member};
-use crate::fairness::Accounts;
 use crate::node_health::Monotonic;
 use crate::report::Refusal;
 use crate::space::Slot;
@@ -20,7 +19,7 @@ pub enum NotOffered {
     Disconnected,
     /// It wants no offers.
     Suppressed,
-    /// Its namespace has no quota left.
+    /// Of what it could want of the node, its namespace's quota leaves nothing.
     Quota,
     /// It declined the node, or let an offer run out.
     Declined {
@@ -58,7 +57,7 @@ impl fmt::Display for NotOffered {
             NotOffered::Suppressed => {
                 f.write_str("the framework suppressed its offers; Revive brings them back")
             }
-            NotOffered::Quota => f.write_str("the namespace has no quota left"),
+            NotOffered::Quota => f.write_str("has nothing that the namespace's quota leaves"),
             NotOffered::Declined { left } => {
                 write!(
                     f,
@@ -87,8 +86,6 @@ impl Book {
         now: Monotonic,
     ) -> Vec<(NodeName, NotOffered)> {
         let Some(place) = self.places.get(&seat) else { return Vec::new() };
-        let exhausted = cluster.has_quotas()
-            && Accounts::of(cluster).is_exhausted(cluster, &place.wish.namespace);
         let why = |slot: Slot, member: &Member| {
             if !place.connected {
                 return NotOffered::Disconnected;
@@ -96,13 +93,18 @@ impl Book {
             if place.suppressed {
                 return NotOffered::Suppressed;
             }
-            if exhausted {
-                return NotOffered::Quota;
-            }
-            if let Some(refusal) = allocator::refusal(member, &place.wish) {
+            if let Some(refusal) = allocator::refusal(cluster.sites(), member, &place.wish) {
                 return NotOffered::Refusal(refusal);
             }
-            match place.refused.get(&slot) {
+            if allocator::is_spent(member, &place.wish) {
+                return NotOffered::Quota;
+            }
+            let score = member
+                .facts
+                .as_ref()
+                .and_then(|f| allocator::score(cluster.sites(), f, &place.wish));
+            // What has gained since would be offered, were there a place for it.
+            match place.refused.get(&slot).filter(|r| !r.has_gained(member, score)) {
                 Some(r) => NotOffered::Declined { left: r.until.saturating_sub(now) },
                 None => NotOffered::NotAmongTheClosest { limit: place.wish.filter.limit() },
             }

@@ -9,7 +9,9 @@
 //! |---|---|
 //! | [`allocator`] | which nodes a framework may be offered, best first: Algorithm 1 behind a trait |
 //! | [`book`] | which offers are out, when they end, what is refused until when |
+//! | [`courtesy`] | what declared tasks leave to frameworks for a moment |
 //! | [`explain`] | why a framework is not offered a node |
+//! | [`refused`] | when what was declined is offered again |
 //! | [`settle`] | whether an Accept gets what it wants, and who goes first when several want the same |
 //!
 //! **Offers are optimistic.** Many frameworks may hold an offer of the same node; nothing is set aside for any of
@@ -21,12 +23,15 @@
 
 pub mod allocator;
 pub mod book;
+pub mod courtesy;
 pub mod explain;
+pub mod refused;
 pub mod settle;
 #[cfg(test)]
 mod tests;
 
 use std::fmt;
+use std::str::FromStr;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -34,16 +39,50 @@ use muster_api::kind::framework::{FrameworkSpec, OfferFilter};
 use muster_api::kind::task::Cost;
 use muster_api::pose::OperationPosition;
 
+use crate::fairness::Spent;
 use crate::node_health::Monotonic;
 use crate::space::Slot;
 
-/// Number of an offer. It is never used again within one life of the controller.
+/// Number of an offer, never used again: the upper half says in which life of the controller it was made, by a random number
+/// ([`OfferId::first`]), so that an Accept from before a restart cannot mean another robot.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct OfferId(pub u64);
 
+/// Lower half: the offers of one life. When they run over, they go on in the next prefix.
+const LIFE_SHIFT: u32 = 32;
+
+impl OfferId {
+    /// The first offer of a life of the controller; `life` is random.
+    #[must_use]
+    pub fn first(life: u32) -> Self {
+        OfferId(u64::from(life) << LIFE_SHIFT | 1)
+    }
+
+    /// The next number.
+    #[must_use]
+    pub fn next(self) -> Self {
+        OfferId(self.0.wrapping_add(1))
+    }
+}
+
+/// A text that is no offer's id.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct NoOfferId;
+
+impl FromStr for OfferId {
+    type Err = NoOfferId;
+
+    fn from_str(text: &str) -> Result<Self, NoOfferId> {
+        let (life, number) = text.split_once('-').ok_or(NoOfferId)?;
+        let life = u32::from_str_radix(life, 16).map_err(|_| NoOfferId)?;
+        let number: u32 = number.parse().map_err(|_| NoOfferId)?;
+        Ok(OfferId(u64::from(life) << LIFE_SHIFT | u64::from(number)))
+    }
+}
+
 impl fmt::Display for OfferId {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{}", self.0)
+        write!(f, "{:x}-{}", self.0 >> LIFE_SHIFT, self.0 & u64::from(u32::MAX))
     }
 }
 
@@ -62,6 +101,9 @@ pub const DEFAULT_REFUSE: Duration = Duration::from_secs(5);
 /// How long contested Accepts are gathered. Frameworks that react to the same change answer within a few milliseconds
 /// of each other; longer would only slow the first one down.
 pub const GATHER: Duration = Duration::from_millis(5);
+/// How long an Accept waits at most for a framework that has less and lost the last race, and a declared task for one that has
+/// less and is offered what was freed: a round trip over a slow link and its thinking.
+pub const COURTESY: Duration = Duration::from_millis(100);
 /// For how long an offer that was rescinded because its node changed can still be accepted: the Accept may have been
 /// on its way. The ledger decides, as for any other.
 pub const IN_FLIGHT: Duration = Duration::from_secs(2);
@@ -79,6 +121,8 @@ pub struct Wish {
     pub cost: Cost,
     /// What a node must have.
     pub filter: OfferFilter,
+    /// What the namespace's quota leaves nothing of, at the last look.
+    pub spent: Spent,
 }
 
 impl Wish {
@@ -91,6 +135,7 @@ impl Wish {
             radius: spec.radius.unwrap_or(f64::INFINITY),
             cost: spec.cost,
             filter: spec.filter.clone(),
+            spent: Spent::default(),
         }
     }
 }
@@ -108,6 +153,8 @@ pub struct Offer {
     pub made_at: Monotonic,
     /// The node's version that it shows.
     pub version: u64,
+    /// What the quota left nothing of when it was made: it does not show that.
+    pub spent: Spent,
 }
 
 /// Why an offer ended without an answer.
@@ -130,7 +177,7 @@ pub enum Rescinded {
     Suppressed,
     /// A closer robot takes its place.
     Closer,
-    /// The namespace has no quota left.
+    /// What the namespace's quota leaves is all used, or not any more; a fresh offer follows where something is left.
     Quota,
 }
 

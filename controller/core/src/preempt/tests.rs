@@ -19,7 +19,14 @@ fn demand(uid: &str, priority: i32, cpu: u64, drives: bool) -> Demand {
     });
     let spec: TaskSpec = serde_json::from_value(spec).expect("a spec");
     let title = format!("default/{uid}").into();
-    Demand { uid: TaskUid::new(uid), title, spec: Arc::new(spec), since: 0, avoid: Arc::default() }
+    Demand {
+        uid: TaskUid::new(uid),
+        title,
+        spec: Arc::new(spec),
+        since: 0,
+        avoid: Arc::default(),
+        framework: None,
+    }
 }
 
 fn cluster(robots: &[(&str, u64)]) -> Cluster {
@@ -283,9 +290,9 @@ proptest! {
         let mut cluster = crowded(&holders, driven);
         let mut demand = demand("new", priority, cpu, drives);
         Arc::make_mut(&mut demand.spec).resources.memory = Some(Bytes(memory));
-        let refused = filter::refusal(cluster.at(0), &demand).is_some();
+        let refused = filter::refusal(cluster.sites(), cluster.at(0), &demand).is_some();
         let expected = refused.then(|| by_brute_force(&holders, driven, (priority, cpu, memory, drives))).flatten();
-        let found = victims(cluster.at(0), &demand);
+        let found = victims(cluster.sites(), cluster.at(0), &demand);
         let found_harm = found.as_ref().map(|v| harm(&cluster.at(0).ledger, v));
         prop_assert_eq!(&found_harm, &expected);
         // Carried out and ended, the task has its place.
@@ -313,7 +320,7 @@ proptest! {
             .map(|(cpu, priority)| Holder { cpu: cpu * 25, memory: 0, priority, stopping: false, work_of: None }).collect();
         let cluster = crowded(&holders, false);
         let demand = demand("new", priority, cpu * 100, false);
-        let Some(victims) = victims(cluster.at(0), &demand) else { return Ok(()) };
+        let Some(victims) = victims(cluster.sites(), cluster.at(0), &demand) else { return Ok(()) };
         let reservation = demand.reservation(cluster.at(0).facts.as_ref().expect("facts"));
         let need = Need { ledger: &cluster.at(0).ledger, reservation: &reservation, kept: Compute::default() };
         prop_assert!(need.is_met(&victims));

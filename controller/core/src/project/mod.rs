@@ -2,7 +2,7 @@
 //!
 //! | module | shows |
 //! |---|---|
-//! | [`pod`] | a Task as a Pod with one container, `task` |
+//! | [`pod`] | a Task as a Pod with one container, `task`, and what a change of that means for the Task |
 //! | [`node`] | a Node as a core Node, and what a change of that means for ours |
 
 pub mod node;
@@ -12,7 +12,7 @@ use muster_api::resource::Compute;
 use serde_json::{Map, Value, json};
 
 /// The metadata that both views share.
-const METADATA: [&str; 11] = [
+const METADATA: [&str; 12] = [
     "name",
     "namespace",
     "uid",
@@ -23,12 +23,36 @@ const METADATA: [&str; 11] = [
     "deletionGracePeriodSeconds",
     "labels",
     "annotations",
+    "finalizers",
     "ownerReferences",
 ];
 
 fn metadata(object: &Value) -> Map<String, Value> {
     let of = |field: &&str| Some(((*field).to_owned(), object["metadata"].get(*field)?.clone()));
     METADATA.iter().filter_map(of).collect()
+}
+
+/// Gives `object` what its changed view says of the metadata that clients own, labels and annotations apart. Which object it
+/// is about, and at which version, goes along: that is held against what there is.
+fn take_metadata(object: &mut Value, changed: &Value) {
+    for field in ["uid", "resourceVersion", "name"] {
+        object["metadata"][field] = changed["metadata"][field].clone();
+    }
+    let Some(metadata) = object["metadata"].as_object_mut() else { return };
+    for field in ["finalizers", "ownerReferences"] {
+        match changed["metadata"][field].as_array().filter(|list| !list.is_empty()) {
+            Some(list) => drop(metadata.insert(field.to_owned(), list.clone().into())),
+            None => drop(metadata.remove(field)),
+        }
+    }
+}
+
+fn set_texts(object: &mut Value, field: &str, texts: Map<String, Value>) {
+    let Some(metadata) = object["metadata"].as_object_mut() else { return };
+    match texts.is_empty() {
+        true => drop(metadata.remove(field)),
+        false => drop(metadata.insert(field.to_owned(), texts.into())),
+    }
 }
 
 /// CR as a Kubernetes resource list.

@@ -3,12 +3,13 @@
 use std::net::{IpAddr, SocketAddr};
 
 use muster_api::kind::node::{Node, NodeKind, NodeStatus};
-use serde_json::{Map, Value, json};
+use muster_api::selector::Labels;
+use serde_json::{Value, json};
 
-use super::{metadata, resources};
+use super::{metadata, resources, set_texts, take_metadata};
 
 /// What Kubernetes' own node controller puts on a cordoned node.
-const UNSCHEDULABLE: &str = "node.kubernetes.io/unschedulable";
+pub const UNSCHEDULABLE: &str = "node.kubernetes.io/unschedulable";
 
 /// The core Node that shows a stored Node.
 #[must_use]
@@ -23,7 +24,9 @@ pub fn node(object: &Value, node: &Node) -> Value {
     let mut taints = object["spec"]["taints"].as_array().cloned().unwrap_or_default();
     if node.spec.unschedulable {
         spec["unschedulable"] = true.into();
-        taints.push(json!({"key": UNSCHEDULABLE, "effect": "NoSchedule"}));
+        if !is_tainted(object) {
+            taints.push(json!({"key": UNSCHEDULABLE, "effect": "NoSchedule"}));
+        }
     }
     if !taints.is_empty() {
         spec["taints"] = taints.into();
@@ -37,15 +40,35 @@ pub fn node(object: &Value, node: &Node) -> Value {
     })
 }
 
+/// Whether somebody has set the taint that the view adds.
+fn is_tainted(object: &Value) -> bool {
+    let taints = object["spec"]["taints"].as_array();
+    taints.into_iter().flatten().any(|taint| taint["key"] == UNSCHEDULABLE)
+}
+
 /// Labels that the view adds where nobody set them.
 fn own_labels(object: &Value, node: &Node) -> Vec<(&'static str, String)> {
-    let role = match node.spec.kind {
+    let name = node.metadata.name.as_deref().unwrap_or_default();
+    let labels = added(node.spec.kind, name);
+    labels.into_iter().filter(|(key, _)| object["metadata"]["labels"].get(*key).is_none()).collect()
+}
+
+fn added(kind: NodeKind, name: &str) -> [(&'static str, String); 2] {
+    let role = match kind {
         NodeKind::Robot => "node-role.kubernetes.io/robot",
         NodeKind::Cloud => "node-role.kubernetes.io/cloud",
     };
-    let name = node.metadata.name.clone().unwrap_or_default();
-    let labels = [(role, String::new()), ("kubernetes.io/hostname", name)];
-    labels.into_iter().filter(|(key, _)| object["metadata"]["labels"].get(*key).is_none()).collect()
+    [(role, String::new()), ("kubernetes.io/hostname", name.to_owned())]
+}
+
+/// The labels of the core Node that shows a Node with these.
+#[must_use]
+pub fn labels(stored: &Labels, kind: NodeKind, name: &str) -> Labels {
+    let mut labels = stored.clone();
+    for (key, value) in added(kind, name) {
+        labels.entry(key.to_owned()).or_insert(value);
+    }
+    labels
 }
 
 fn node_status(object: &Value, node: &Node, status: &NodeStatus) -> Value {
@@ -112,16 +135,17 @@ pub fn changed(object: &Value, node: &Node, changed: &Value) -> Value {
             labels.remove(key);
         }
     }
-    set(&mut object["metadata"], "labels", labels);
+    set_texts(&mut object, "labels", labels);
     let annotations = changed["metadata"]["annotations"].as_object().cloned().unwrap_or_default();
-    set(&mut object["metadata"], "annotations", annotations);
-    for field in ["uid", "resourceVersion", "name"] {
-        object["metadata"][field] = changed["metadata"][field].clone();
-    }
+    set_texts(&mut object, "annotations", annotations);
+    take_metadata(&mut object, changed);
     object["spec"]["unschedulable"] =
         (changed["spec"]["unschedulable"] == Value::Bool(true)).into();
     let mut taints = changed["spec"]["taints"].as_array().cloned().unwrap_or_default();
-    taints.retain(|taint| taint["key"] != UNSCHEDULABLE);
+    // What the view adds is not written; what somebody has set stays theirs.
+    if !is_tainted(&object) {
+        taints.retain(|taint| taint["key"] != UNSCHEDULABLE);
+    }
     for taint in &mut taints {
         if let Some(taint) = taint.as_object_mut() {
             taint.remove("timeAdded");
@@ -129,14 +153,6 @@ pub fn changed(object: &Value, node: &Node, changed: &Value) -> Value {
     }
     object["spec"]["taints"] = taints.into();
     object
-}
-
-fn set(metadata: &mut Value, field: &str, map: Map<String, Value>) {
-    let Some(metadata) = metadata.as_object_mut() else { return };
-    match map.is_empty() {
-        true => drop(metadata.remove(field)),
-        false => drop(metadata.insert(field.to_owned(), map.into())),
-    }
 }
 
 #[cfg(test)]
@@ -179,5 +195,21 @@ mod tests {
         let again: Node = serde_json::from_value(changed.clone()).expect("a node");
         let shown = node(&changed, &again);
         assert_eq!(shown["spec"]["taints"][1]["key"], UNSCHEDULABLE);
+    }
+
+    #[test]
+    fn a_taint_that_somebody_set_is_not_taken_for_the_views_own() {
+        let object = json!({
+            "apiVersion": "muster.dev/v1alpha1", "kind": "Node", "metadata": {"name": "r1", "labels": {"a": "b"}},
+            "spec": {"kind": "Robot", "unschedulable": true, "taints": [{"key": UNSCHEDULABLE, "effect": "NoSchedule"}]},
+        });
+        let ours: Node = serde_json::from_value(object.clone()).expect("a node");
+        let mut view = node(&object, &ours);
+        assert_eq!(view["spec"]["taints"], object["spec"]["taints"], "once");
+        let stored: Labels =
+            serde_json::from_value(object["metadata"]["labels"].clone()).expect("texts");
+        assert_eq!(json!(labels(&stored, NodeKind::Robot, "r1")), view["metadata"]["labels"]);
+        view["metadata"]["labels"]["floor"] = "3".into();
+        assert_eq!(changed(&object, &ours, &view)["spec"]["taints"], object["spec"]["taints"]);
     }
 }

@@ -4,7 +4,15 @@ use muster_api::kind::task::{EnvVar, Network, RestartPolicy, Task, TaskSpec, Tas
 use muster_api::phase::TaskPhase;
 use serde_json::{Value, json};
 
-use super::{condition, metadata, resources};
+use super::{condition, metadata, resources, set_texts, take_metadata};
+
+/// Fields of a Pod's spec that may change, and where they stand in a Task. Tolerations and the grace period are those that
+/// Kubernetes lets change as well.
+const CHANGEABLE: [(&str, &[&str]); 3] = [
+    ("tolerations", &["spec", "placement", "tolerations"]),
+    ("terminationGracePeriodSeconds", &["spec", "gracePeriodSeconds"]),
+    ("priority", &["spec", "priority"]),
+];
 
 /// The name of a task's one container.
 pub const CONTAINER: &str = "task";
@@ -20,6 +28,48 @@ pub fn pod(object: &Value, task: &Task) -> Value {
         "spec": spec(&task.spec, &status),
         "status": pod_status(object, &task.spec, &status),
     })
+}
+
+/// Our Task with what `changed`, a changed copy of its view, asks for: its metadata, and what of a Task's spec may change.
+/// What it says of the status says nothing here.
+///
+/// # Errors
+/// The fields of the view that were changed and cannot be.
+pub fn changed(object: &Value, task: &Task, changed: &Value) -> Result<Value, Vec<String>> {
+    let (view, mut object) = (pod(object, task), object.clone());
+    for field in ["labels", "annotations"] {
+        let texts = changed["metadata"][field].as_object().cloned().unwrap_or_default();
+        set_texts(&mut object, field, texts);
+    }
+    take_metadata(&mut object, changed);
+    let fields = |view: &Value| view["spec"].as_object().cloned().unwrap_or_default();
+    let (before, after) = (fields(&view), fields(changed));
+    let mut refused = Vec::new();
+    for field in before.keys().chain(after.keys().filter(|field| !before.contains_key(*field))) {
+        if before.get(field) == after.get(field) {
+            continue;
+        }
+        let place = CHANGEABLE.iter().find(|(name, _)| name == field).map(|(_, place)| *place);
+        match (place, after.get(field)) {
+            (Some(place), value) => put(&mut object, place, value.filter(|v| !v.is_null())),
+            (None, _) => refused.push(format!("spec.{field}")),
+        }
+    }
+    if refused.is_empty() { Ok(object) } else { Err(refused) }
+}
+
+/// Puts a value at a place; none takes away what is there, which is the default.
+fn put(object: &mut Value, place: &[&str], value: Option<&Value>) {
+    let Some((last, way)) = place.split_last() else { return };
+    let parent = way.iter().fold(object, |object, step| &mut object[*step]);
+    match value {
+        Some(value) => parent[*last] = value.clone(),
+        None => {
+            if let Some(fields) = parent.as_object_mut() {
+                fields.remove(*last);
+            }
+        }
+    }
 }
 
 fn spec(spec: &TaskSpec, status: &TaskStatus) -> Value {
@@ -223,5 +273,38 @@ mod tests {
         );
         let end = &killed["status"]["containerStatuses"][0]["state"]["terminated"];
         assert_eq!((&end["exitCode"], &end["reason"]), (&json!(137), &json!("OOMKilled")));
+    }
+
+    #[test]
+    fn a_changed_pod_is_a_changed_task_or_says_which_field_it_cannot_be() {
+        let object = json!({
+            "apiVersion": "muster.dev/v1alpha1", "kind": "Task",
+            "metadata": {"name": "t", "uid": "u", "resourceVersion": "7", "labels": {"a": "b"}, "finalizers": ["x/y"]},
+            "spec": {"priority": 1, "run": {"process": {"command": ["sh"]}}},
+        });
+        let task: Task = serde_json::from_value(object.clone()).expect("a task");
+        let view = pod(&object, &task);
+        let same = changed(&object, &task, &view).expect("nothing was changed");
+        assert_eq!(same, object);
+
+        let mut wanted = view;
+        wanted["metadata"]["labels"] = json!({"c": "d"});
+        wanted["metadata"]["finalizers"] = json!([]);
+        wanted["spec"]["priority"] = 5.into();
+        wanted["spec"]["tolerations"] = json!([{"key": "k", "operator": "Exists"}]);
+        wanted["status"]["phase"] = "Failed".into();
+        let new = changed(&object, &task, &wanted).expect("all of it may change");
+        assert_eq!(new["metadata"]["labels"], json!({"c": "d"}));
+        assert!(new["metadata"].get("finalizers").is_none());
+        assert_eq!(new["spec"]["priority"], 5);
+        assert_eq!(new["spec"]["placement"]["tolerations"][0]["key"], "k");
+        assert!(new.get("status").is_none());
+        let again: Task = serde_json::from_value(new.clone()).expect("a task");
+        assert_eq!(pod(&new, &again)["spec"], wanted["spec"], "and shows what was wanted");
+
+        wanted["spec"]["containers"][0]["image"] = "other".into();
+        wanted["spec"]["hostPID"] = true.into();
+        let refused = changed(&object, &task, &wanted).expect_err("what runs is the Task's");
+        assert_eq!(refused, ["spec.containers", "spec.hostPID"]);
     }
 }

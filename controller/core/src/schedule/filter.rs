@@ -13,10 +13,11 @@ use crate::cluster::{Member, NodeFacts};
 use crate::fairness::namespace_of;
 use crate::ledger::Denied;
 use crate::report::Refusal;
+use crate::site::{Sites, Travel};
 
 /// The first reason for which `member` does not take the task; none: it does.
 #[must_use]
-pub fn refusal(member: &Member, demand: &Demand) -> Option<Refusal> {
+pub fn refusal(sites: &Sites, member: &Member, demand: &Demand) -> Option<Refusal> {
     let Some(facts) = &member.facts else {
         return Some(Refusal::NotReady { message: "its Node object is gone".to_owned() });
     };
@@ -27,7 +28,7 @@ pub fn refusal(member: &Member, demand: &Demand) -> Option<Refusal> {
         .or_else(|| abilities(facts, spec))
         .or_else(|| too_small(member, spec))
         .or_else(|| admission(facts, spec))
-        .or_else(|| reach(facts, spec))
+        .or_else(|| reach(sites, facts, spec))
         .or_else(|| charge(facts, spec))
         .or_else(|| what_is_left(member, facts, demand))
 }
@@ -47,12 +48,16 @@ fn identity(name: &str, facts: &NodeFacts, spec: &TaskSpec) -> Option<Refusal> {
         .then(|| Refusal::SelectorMismatch { selector: placement.selector.to_string() })
 }
 
-/// Work for an executor goes where that executor is.
+/// Work for an executor goes where that executor is, and only to one of the same framework: a name in a namespace is no
+/// permission.
 fn executor(member: &Member, demand: &Demand) -> Option<Refusal> {
     let task = &demand.spec.run.executor.as_ref()?.task;
     let namespace = namespace_of(&demand.title);
     let is_it = |title: &str| title.split_once('/') == Some((namespace, task.as_str()));
-    let here = member.ledger.reservations().any(|(_, r)| is_it(&r.title) && !r.standing.stopping);
+    let here = member
+        .ledger
+        .reservations()
+        .any(|(_, r)| is_it(&r.title) && r.framework == demand.framework && !r.standing.stopping);
     (!here).then(|| Refusal::NoExecutor { task: task.clone() })
 }
 
@@ -147,18 +152,17 @@ fn admission(facts: &NodeFacts, spec: &TaskSpec) -> Option<Refusal> {
 }
 
 /// The range filter (Avalon, Alg. 1). Cloud nodes have no pose; it does not apply to them.
-fn reach(facts: &NodeFacts, spec: &TaskSpec) -> Option<Refusal> {
+fn reach(sites: &Sites, facts: &NodeFacts, spec: &TaskSpec) -> Option<Refusal> {
     let placement = &spec.placement;
     let within = placement.within.unwrap_or(f64::INFINITY);
-    reach_of(facts, placement.at.as_ref(), within, placement.cost)
+    reach_of(sites, facts, (placement.at.as_ref(), within, placement.cost))
 }
 
 /// The same for any operation position, radius in metres and cost, a task's or a framework's.
 pub(crate) fn reach_of(
+    sites: &Sites,
     facts: &NodeFacts,
-    at: Option<&OperationPosition>,
-    within: f64,
-    cost: Cost,
+    (at, within, cost): (Option<&OperationPosition>, f64, Cost),
 ) -> Option<Refusal> {
     let at = at.filter(|_| facts.kind == NodeKind::Robot)?;
     let Some(pose) = &facts.pose else {
@@ -173,7 +177,19 @@ pub(crate) fn reach_of(
     if distance > within {
         return Some(Refusal::OutOfRange { distance, within });
     }
-    (cost == Cost::TravelTime && facts.speed.is_none()).then_some(Refusal::NoSpeed)
+    if cost == Cost::Distance {
+        return None;
+    }
+    if facts.speed.is_none() {
+        return Some(Refusal::NoSpeed);
+    }
+    match sites.travel(at, pose) {
+        Travel::NoSite | Travel::Way(_) => None,
+        Travel::None(why) => {
+            let site = sites.of_map(&at.map).unwrap_or_default().to_owned();
+            Some(Refusal::Unreachable { site, why })
+        }
+    }
 }
 
 fn what_is_left(member: &Member, facts: &NodeFacts, demand: &Demand) -> Option<Refusal> {

@@ -4,14 +4,18 @@
 //! where, and for every other one why no node takes it. The plan's reservations are made in the
 //! cluster as it goes; whoever cannot carry a bind out releases it again.
 //!
-//! Order of tasks: priority, then who waited longest. Order of nodes: a task that needs computation
+//! Order of tasks: priority, then the namespace with the least weighted dominant share, its share counted anew after every
+//! place that it got, then who waited longest. Order of nodes: a task that needs computation
 //! only tries the cloud first; robots by score where there is an operation position; else by fuller battery and most
 //! free CR. Nodes with a taint of effect PreferNoSchedule come after those, and nodes that the task has failed on last. A
-//! task that has no place may make room: see [`crate::preempt`].
+//! task that has no place may make room: see [`crate::preempt`]. What was just freed is left for a moment to frameworks that
+//! have less: see [`crate::offer::courtesy`].
 
+mod courtesy;
 pub mod filter;
 pub mod score;
 
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::Arc;
 
 use muster_api::id::{Epoch, TaskUid};
@@ -26,6 +30,9 @@ use crate::preempt::{self, Preemption};
 use crate::report::Refusal;
 use crate::space::Slot;
 
+pub use courtesy::Claim;
+use courtesy::refusal;
+
 /// A task that waits for a place.
 #[derive(Debug, Clone)]
 pub struct Demand {
@@ -39,6 +46,8 @@ pub struct Demand {
     pub since: u64,
     /// Nodes that it has failed on: they come last.
     pub avoid: Arc<[NodeName]>,
+    /// Uid of the framework that launched it; none: a declared task.
+    pub framework: Option<Arc<str>>,
 }
 
 /// The order of creation: by time, which an object tells in seconds since 1970, and in a second by the store's revision.
@@ -58,6 +67,7 @@ impl Demand {
             groups: facts.groups_for(&self.spec.resources.actuators),
             standing: standing(&self.title, &self.spec, false),
             apart: self.spec.placement.apart.as_deref().map(Into::into),
+            framework: self.framework.clone(),
         }
     }
 }
@@ -93,6 +103,14 @@ pub struct Wait {
     pub uid: TaskUid,
     /// Why, per node; one list for all that ask the same.
     pub why: Arc<[NodeRefusal]>,
+    /// For a moment only: it leaves a node that would take it. Older reasons may stand meanwhile.
+    pub brief: bool,
+}
+
+impl Wait {
+    fn new(demand: &Demand, why: Arc<[NodeRefusal]>) -> Self {
+        Wait { uid: demand.uid.clone(), why, brief: false }
+    }
 }
 
 /// What is to be done.
@@ -104,6 +122,8 @@ pub struct Plan {
     pub waits: Vec<Wait>,
     /// Tasks that are to end, to make room for some of those that wait.
     pub preemptions: Vec<Preemption>,
+    /// What some of those that wait leave to frameworks.
+    pub claims: Vec<Claim>,
 }
 
 /// Most nodes that are named in a task's reasons; the others are counted. A status must not grow
@@ -135,32 +155,31 @@ fn decide(cluster: &mut Cluster, demands: &mut [Demand], depth: Depth) -> Plan {
     demands.sort_by_key(|d| (std::cmp::Reverse(d.spec.priority), d.since));
     let mut plan = Plan::default();
     // A pass only takes, so what had no place for a task has none for one that asks the same.
-    let mut hopeless: Vec<(&Demand, Arc<[NodeRefusal]>)> = Vec::new();
-    let mut accounts = cluster.has_quotas().then(|| Accounts::of(cluster));
-    for demand in demands.iter() {
-        if let Some(over) = accounts.as_ref().and_then(|a| over_quota(cluster, a, demand)) {
+    let mut hopeless = Hopeless::default();
+    let mut accounts = cluster.accounts().clone();
+    let mut turns = Turns::new(demands);
+    while let Some(demand) = turns.next(cluster, &accounts) {
+        if let Some(over) = over_quota(cluster, &accounts, demand) {
             cluster.unnominate(&demand.uid);
-            plan.waits.push(Wait { uid: demand.uid.clone(), why: [quota_refusal(&over)].into() });
+            plan.waits.push(Wait::new(demand, [quota_refusal(&over)].into()));
             continue;
         }
         // One for which room is kept has what others have not.
         let nominated = cluster.nomination(&demand.uid).is_some();
-        let mut remembered = hopeless.iter().filter(|_| !nominated);
-        let known = remembered.find(|(known, _)| asks_the_same(known, demand));
-        if let Some((_, why)) = known {
-            plan.waits.push(Wait { uid: demand.uid.clone(), why: Arc::clone(why) });
+        if let Some(wait) = hopeless.known(demand).filter(|_| !nominated) {
+            plan.waits.push(wait);
             continue;
         }
         let place = choose(cluster, demand);
-        if place.is_none() && depth == Depth::Whole {
+        let claims = if place.is_none() { courtesy::claims(cluster, demand) } else { Vec::new() };
+        // Nobody is ended for one that may have a place in a moment.
+        if place.is_none() && claims.is_empty() && depth == Depth::Whole {
             if let Some((preemption, why)) = preempt::make_room(cluster, demand) {
-                if let Some(accounts) = accounts.as_mut() {
-                    // It counts already: nobody is ended for room that the quota would not let it have.
-                    let resources = &demand.spec.resources;
-                    let leases = u64::from(!resources.actuators.is_empty());
-                    accounts.add(namespace_of(&demand.title), &resources.reserved(), leases);
-                }
-                plan.waits.push(Wait { uid: demand.uid.clone(), why: [why].into() });
+                // It counts already: nobody is ended for room that the quota would not let it have.
+                let resources = &demand.spec.resources;
+                let leases = u64::from(!resources.actuators.is_empty());
+                accounts.add(namespace_of(&demand.title), &resources.reserved(), leases);
+                plan.waits.push(Wait::new(demand, [why].into()));
                 plan.preemptions.push(preemption);
                 continue;
             }
@@ -169,11 +188,10 @@ fn decide(cluster: &mut Cluster, demands: &mut [Demand], depth: Depth) -> Plan {
         match place {
             Some(slot) => {
                 let bind = take(cluster, demand, slot);
-                if let Some(accounts) = accounts.as_mut() {
-                    let compute = demand.spec.resources.reserved();
-                    let leases = bind.leases.len() as u64;
-                    accounts.add(namespace_of(&demand.title), &compute, leases);
-                }
+                let compute = demand.spec.resources.reserved();
+                let (namespace, leases) = (namespace_of(&demand.title), bind.leases.len() as u64);
+                accounts.add(namespace, &compute, leases);
+                cluster.serve(namespace, &compute, leases);
                 plan.binds.push(bind);
             }
             None => {
@@ -181,15 +199,65 @@ fn decide(cluster: &mut Cluster, demands: &mut [Demand], depth: Depth) -> Plan {
                     Depth::Whole => summarise(explain(cluster, demand)).into(),
                     Depth::Places => [].into(),
                 };
-                if hopeless.len() == HOPELESS_KEPT {
-                    hopeless.remove(0);
-                }
-                hopeless.push((demand, Arc::clone(&why)));
-                plan.waits.push(Wait { uid: demand.uid.clone(), why });
+                let wait = Wait { brief: !claims.is_empty(), ..Wait::new(demand, why) };
+                plan.claims.extend(claims);
+                hopeless.remember(demand, &wait);
+                plan.waits.push(wait);
             }
         }
     }
     plan
+}
+
+/// Whose turn it is, of tasks that are sorted by priority and age.
+#[derive(Debug)]
+struct Turns<'a> {
+    rest: &'a [Demand],
+    /// Those of the present priority, by namespace.
+    waiting: BTreeMap<&'a str, VecDeque<&'a Demand>>,
+    /// Each namespace that waits: its share, since when its first task waits, its name.
+    order: BTreeSet<(Share, u64, &'a str)>,
+    /// Whose turn it was: its share may be another now.
+    last: Option<&'a str>,
+}
+
+/// A share, which is never negative: its bits have its order.
+type Share = u64;
+
+impl<'a> Turns<'a> {
+    fn new(sorted: &'a [Demand]) -> Self {
+        Turns { rest: sorted, waiting: BTreeMap::new(), order: BTreeSet::new(), last: None }
+    }
+
+    fn next(&mut self, cluster: &Cluster, accounts: &Accounts) -> Option<&'a Demand> {
+        if let Some(namespace) = self.last.take() {
+            self.line_up(namespace, cluster, accounts);
+        }
+        if self.order.is_empty() {
+            let priority = self.rest.first()?.spec.priority;
+            let same = self.rest.partition_point(|demand| demand.spec.priority >= priority);
+            let (same, rest) = self.rest.split_at(same);
+            self.rest = rest;
+            for demand in same {
+                self.waiting.entry(namespace_of(&demand.title)).or_default().push_back(demand);
+            }
+            let namespaces: Vec<&str> = self.waiting.keys().copied().collect();
+            namespaces.into_iter().for_each(|n| self.line_up(n, cluster, accounts));
+        }
+        let (_, _, namespace) = self.order.pop_first()?;
+        self.last = Some(namespace);
+        self.waiting.get_mut(namespace)?.pop_front()
+    }
+
+    fn line_up(&mut self, namespace: &'a str, cluster: &Cluster, accounts: &Accounts) {
+        match self.waiting.get(namespace).and_then(VecDeque::front) {
+            Some(first) => {
+                let share = accounts.share(cluster, namespace);
+                self.order.insert((share.to_bits(), first.since, namespace));
+            }
+            None => drop(self.waiting.remove(namespace)),
+        }
+    }
 }
 
 /// What of its namespace's quota a task would pass.
@@ -215,6 +283,29 @@ pub fn quota_refusal(over: &OverQuota) -> NodeRefusal {
 /// memory would cost more in comparing than it saves in scanning.
 const HOPELESS_KEPT: usize = 8;
 
+/// The last demands of a pass that were refused.
+#[derive(Debug, Default)]
+struct Hopeless<'a>(VecDeque<(&'a Demand, Wait)>);
+
+impl<'a> Hopeless<'a> {
+    fn remember(&mut self, demand: &'a Demand, wait: &Wait) {
+        if self.0.len() == HOPELESS_KEPT {
+            self.0.pop_front();
+        }
+        self.0.push_back((demand, wait.clone()));
+    }
+
+    /// What was said of one that asks the same. What one leaves, another of less may take.
+    fn known(&self, demand: &Demand) -> Option<Wait> {
+        let says = |(known, wait): &&(&Demand, Wait)| {
+            let as_rich = || namespace_of(&known.title) == namespace_of(&demand.title);
+            asks_the_same(known, demand) && (!wait.brief || as_rich())
+        };
+        let (_, wait) = self.0.iter().find(says)?;
+        Some(Wait { uid: demand.uid.clone(), ..wait.clone() })
+    }
+}
+
 fn asks_the_same(a: &Demand, b: &Demand) -> bool {
     let (one, other) = (&a.spec, &b.spec);
     one.resources == other.resources
@@ -230,7 +321,7 @@ fn asks_the_same(a: &Demand, b: &Demand) -> bool {
 pub(crate) fn take(cluster: &mut Cluster, demand: &Demand, slot: Slot) -> Bind {
     let member = cluster.at(slot);
     let facts = member.facts.as_ref().expect("a chosen node passed the filters, so it has facts");
-    let (node, score) = (member.name.clone(), score::score(facts, &demand.spec));
+    let (node, score) = (member.name.clone(), score::score(cluster.sites(), facts, &demand.spec));
     let reservation = demand.reservation(facts);
     let groups = reservation.groups.clone();
     cluster
@@ -250,7 +341,7 @@ fn choose(cluster: &Cluster, demand: &Demand) -> Option<Slot> {
     let spec = &*demand.spec;
     if let Some(node) = &spec.placement.node {
         let slot = cluster.slot_of(node)?;
-        return filter::refusal(cluster.at(slot), demand).is_none().then_some(slot);
+        return refusal(cluster, slot, demand).is_none().then_some(slot);
     }
     if let Some(slot) = preferred(cluster, demand) {
         return Some(slot);
@@ -282,7 +373,7 @@ fn choose(cluster: &Cluster, demand: &Demand) -> Option<Slot> {
 /// The node that the task asks to be tried first, when it takes the task.
 fn preferred(cluster: &Cluster, demand: &Demand) -> Option<Slot> {
     let slot = cluster.slot_of(demand.spec.placement.prefer.as_deref()?)?;
-    let takes = filter::refusal(cluster.at(slot), demand).is_none();
+    let takes = refusal(cluster, slot, demand).is_none();
     (takes && !has_failed_on(cluster, demand, slot)).then_some(slot)
 }
 
@@ -330,7 +421,7 @@ fn first_fit(
     second_best: &mut SecondBest,
 ) -> Option<Slot> {
     for slot in slots {
-        if filter::refusal(cluster.at(slot), demand).is_some() {
+        if refusal(cluster, slot, demand).is_some() {
             continue;
         }
         match resort(cluster, demand, slot) {
@@ -357,7 +448,7 @@ fn nearest_fit(cluster: &Cluster, demand: &Demand, second_best: &mut SecondBest)
         if best.is_some_and(|(distance, _)| found.distance > distance) {
             break;
         }
-        if filter::refusal(cluster.at(found.slot), demand).is_some() {
+        if refusal(cluster, found.slot, demand).is_some() {
             continue;
         }
         if let Some(resort) = resort(cluster, demand, found.slot) {
@@ -378,9 +469,10 @@ fn best_scored(cluster: &Cluster, demand: &Demand, second_best: &mut SecondBest)
     let mut scored: Vec<_> = cluster
         .space()
         .nearest(&at.map, at.position(), radius)
-        .filter(|found| filter::refusal(cluster.at(found.slot), demand).is_none())
+        .filter(|found| refusal(cluster, found.slot, demand).is_none())
         .filter_map(|found| {
-            let score = score::score(cluster.at(found.slot).facts.as_ref()?, &demand.spec)?;
+            let facts = cluster.at(found.slot).facts.as_ref()?;
+            let score = score::score(cluster.sites(), facts, &demand.spec)?;
             Some((score, rank(cluster, found.slot), found.slot))
         })
         .collect();
@@ -393,7 +485,7 @@ fn best_scored(cluster: &Cluster, demand: &Demand, second_best: &mut SecondBest)
 pub fn explain(cluster: &Cluster, demand: &Demand) -> Vec<(NodeName, Refusal)> {
     let mut refusals: Vec<(NodeName, Refusal)> = cluster
         .members()
-        .filter_map(|(_, member)| Some((member.name.clone(), filter::refusal(member, demand)?)))
+        .filter_map(|(slot, member)| Some((member.name.clone(), refusal(cluster, slot, demand)?)))
         .collect();
     refusals
         .sort_by(|(a_name, a), (b_name, b)| hardness(a).cmp(&hardness(b)).then(a_name.cmp(b_name)));
@@ -406,9 +498,13 @@ fn hardness(refusal: &Refusal) -> u8 {
         Refusal::LeaseHeld { .. }
         | Refusal::Exhausted { .. }
         | Refusal::Kept { .. }
+        | Refusal::Left { .. }
         | Refusal::Apart { .. }
         | Refusal::NoExecutor { .. } => 0,
-        Refusal::OutOfRange { .. } | Refusal::NoPose | Refusal::NotLocalized => 1,
+        Refusal::OutOfRange { .. }
+        | Refusal::Unreachable { .. }
+        | Refusal::NoPose
+        | Refusal::NotLocalized => 1,
         Refusal::NotReady { .. }
         | Refusal::Cordoned
         | Refusal::Tainted { .. }

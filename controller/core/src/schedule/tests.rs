@@ -25,6 +25,7 @@ fn demand(uid: &str, mut spec: serde_json::Value) -> Demand {
         spec: Arc::new(serde_json::from_value(spec).expect("a spec")),
         since: 0,
         avoid: Arc::default(),
+        framework: None,
     }
 }
 
@@ -238,11 +239,11 @@ fn travel_time_divides_by_speed() {
 fn by_scan(cluster: &Cluster, demand: &Demand) -> Option<(bool, u64)> {
     cluster
         .members()
-        .filter(|(_, m)| filter::refusal(m, demand).is_none())
+        .filter(|(_, m)| filter::refusal(cluster.sites(), m, demand).is_none())
         .map(|(_, m)| {
             let facts = m.facts.as_ref().expect("it passed");
             let on_robot = facts.kind == Robot;
-            let score = score::score(facts, &demand.spec).unwrap_or(0.0);
+            let score = score::score(cluster.sites(), facts, &demand.spec).unwrap_or(0.0);
             (on_robot, (score * 1e6) as u64)
         })
         .min()
@@ -360,7 +361,7 @@ proptest! {
         let demand = avoiding(&avoid, spec);
         let takes = |avoided: bool| {
             cluster.members().any(|(_, member)| {
-                filter::refusal(member, &demand).is_none() && avoid.contains(&member.name.as_str()) == avoided
+                filter::refusal(cluster.sites(), member, &demand).is_none() && avoid.contains(&member.name.as_str()) == avoided
             })
         };
         let (others, failed) = (takes(false), takes(true));
@@ -370,4 +371,63 @@ proptest! {
             None => prop_assert!(!others && !failed),
         }
     }
+}
+
+/// A name in a namespace is no permission: works go to executors of who launched them.
+#[test]
+fn work_goes_to_an_executor_of_its_own_framework() {
+    let mut cluster = cluster(&[("r", node(Robot, 1000, Some((0.0, 0.0))))]);
+    let of = |demand: Demand, framework: Option<&str>| Demand {
+        framework: framework.map(Into::into),
+        ..demand
+    };
+    let mut executor = [of(demand("executor", json!({})), Some("crew"))];
+    assert_eq!(bound(&schedule(&mut cluster, &mut executor)), [("executor", "r")]);
+    let work = |framework: Option<&str>| {
+        let mut work = demand("work", json!({}));
+        let mut spec = (*work.spec).clone();
+        spec.run =
+            serde_json::from_value(json!({"executor": {"task": "executor"}})).expect("a run");
+        work.spec = Arc::new(spec);
+        of(work, framework)
+    };
+    for stranger in [None, Some("others")] {
+        let plan = schedule(&mut cluster, &mut [work(stranger)]);
+        assert_eq!(reasons(&plan), [("r", "NoExecutor")], "{stranger:?}");
+    }
+    assert_eq!(bound(&schedule(&mut cluster, &mut [work(Some("crew"))])), [("work", "r")]);
+}
+
+/// Of equal priority, the namespace that has least comes first, by its weight; a more important task before all.
+#[test]
+fn namespaces_of_equal_priority_share_by_their_weights() {
+    let mut cluster = Cluster::new();
+    cluster.upsert_node(&name("c"), &node(NodeKind::Cloud, 1_000, None));
+    let quota = muster_api::kind::quota::QuotaSpec { weight: 3.0, ..Default::default() };
+    cluster.set_quota("heavy", Some(quota));
+    let demand = |title: String, since: u64, priority: i32| {
+        let spec = json!({
+            "run": {"process": {"command": ["true"]}}, "resources": {"cpu": "100m"}, "priority": priority,
+        });
+        Demand {
+            uid: TaskUid::new(title.clone()),
+            title: title.into(),
+            spec: Arc::new(serde_json::from_value(spec).expect("a spec")),
+            since,
+            avoid: Arc::default(),
+            framework: None,
+        }
+    };
+    // Ten of each, the light ones first, and there is room for ten.
+    let light = (0..10).map(|i| demand(format!("light/{i}"), i, 0));
+    let heavy = (0..10).map(|i| demand(format!("heavy/{i}"), 100 + i, 0));
+    let first = demand("light/first".to_owned(), 1_000, 5);
+    let mut demands: Vec<Demand> = light.chain(heavy).chain([first]).collect();
+    let plan = schedule(&mut cluster, &mut demands);
+    let bound: Vec<&str> = plan.binds.iter().map(|bind| bind.uid.as_str()).collect();
+    let of = |namespace: &str| bound.iter().filter(|uid| uid.starts_with(namespace)).count();
+    assert_eq!(bound[0], "light/first");
+    assert_eq!((of("heavy"), of("light")), (7, 3), "{bound:?}");
+    assert_eq!(bound[1], "heavy/0", "light has something already");
+    assert_eq!(plan.waits.len(), 11);
 }

@@ -60,6 +60,17 @@ pub enum Fault {
         /// What the probe said.
         message: String,
     },
+    /// It was not begun, because its node did not have its image in time.
+    ImageNotThere {
+        /// The image.
+        image: String,
+        /// The node.
+        node: String,
+        /// How long there was, seconds.
+        deadline: u64,
+        /// Why the last pull failed; empty: none has.
+        message: String,
+    },
     /// It did not get as far as running in time.
     DeadlineExceeded {
         /// How long it had, seconds.
@@ -78,6 +89,7 @@ impl Fault {
         match self {
             Fault::Crashed { .. } => "Crashed",
             Fault::ProbeFailed { .. } => "ProbeFailed",
+            Fault::ImageNotThere { .. } => "ImagePullFailed",
             Fault::DeadlineExceeded { .. } => "ProgressDeadlineExceeded",
         }
     }
@@ -90,6 +102,10 @@ impl fmt::Display for Fault {
             Fault::Crashed { message } => write!(f, "crashed: {message}"),
             Fault::ProbeFailed { deadline, message } => {
                 write!(f, "ran and was not ready within {deadline} s")?;
+                if message.is_empty() { Ok(()) } else { write!(f, ": {message}") }
+            }
+            Fault::ImageNotThere { image, node, deadline, message } => {
+                write!(f, "was left as it was: {node} did not have {image} within {deadline} s")?;
                 if message.is_empty() { Ok(()) } else { write!(f, ": {message}") }
             }
             Fault::DeadlineExceeded { deadline, phase, message } => {
@@ -157,7 +173,7 @@ pub fn due(task: &TaskView, node: Option<&NodeView>, deadline: Duration) -> Time
 }
 
 /// Refusals because another task is there.
-const TAKEN: [&str; 4] = ["LeaseHeld", "Apart", "KeptForAnother", PREEMPTING];
+const TAKEN: [&str; 5] = ["LeaseHeld", "Apart", "KeptForAnother", "LeftToFramework", PREEMPTING];
 /// Refusals because the node takes nothing now.
 const SHUT: [&str; 4] = ["NotReady", "Cordoned", "OutOfService", "BatteryLow"];
 

@@ -14,6 +14,7 @@
 //! | [`health`] | whether a task is ready, available, or has failed its template |
 //! | [`revision`] | which template is wanted, which was good, which are forgotten |
 //! | [`places`] | how many tasks or which nodes; what is missing, what is too much |
+//! | [`images`] | which images nodes are to have before their tasks are changed |
 //! | [`rollout`] | canary, how many at once, giving up, being done |
 //! | [`status`] | the numbers and conditions that people see |
 //!
@@ -22,12 +23,14 @@
 //! - A place has one Task object at a time: the next is created when the one before is gone. So there is never one more
 //!   than the set asks for, and two drivers never come from here.
 //! - A task that is available is ended for a rollout only while at most `maxUnavailable` are down with it.
+//! - A task is ended for a template with another image only when its node has that image.
 //! - While a node is under a mission lock, no task there is ended: not for a rollout, a smaller `replicas`, or a label.
 //! - A task whose node cannot be reached is not ended for a rollout: nobody knows what it is in the middle of.
 //! - A rollout that fails goes back to the last revision that was available everywhere, and stays there until the
 //!   template is changed again: applying the same manifest once more does not try the same fault once more.
 
 pub mod health;
+pub mod images;
 pub mod places;
 pub mod revision;
 pub mod rollout;
@@ -226,6 +229,7 @@ pub fn plan(snapshot: &Snapshot<'_>, now: Timestamp) -> Plan {
     places::clean_up(&crew, now, &mut plan);
     places::shrink(snapshot, &crew, &course, &mut plan);
     places::fill(snapshot, &crew, &course, &mut plan);
+    images::ask(snapshot, &crew, &course, now, &mut plan);
     rollout::change(snapshot, &crew, &course, &mut plan);
     rollout::conclude(snapshot, &crew, &course, now, &mut plan);
     revision::forget(snapshot, &course, &mut plan);

@@ -120,7 +120,11 @@ impl<'a> Crew<'a> {
 
     /// The node that a task is on, waits for, or had.
     pub(super) fn node(&self, task: &TaskView) -> Option<&'a NodeView> {
-        let name = task.place().or(task.prefer.as_deref())?;
+        self.node_named(task.place().or(task.prefer.as_deref())?)
+    }
+
+    /// A node by its name.
+    pub(super) fn node_named(&self, name: &str) -> Option<&'a NodeView> {
         self.nodes.get(name)
     }
 

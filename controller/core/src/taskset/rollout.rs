@@ -10,7 +10,7 @@ use muster_api::phase::TaskPhase;
 use super::health::{Fault, due, fault, is_excused, is_stranded};
 use super::places::{Crew, Member};
 use super::revision::History;
-use super::{Action, Ending, News, Plan, Snapshot, after};
+use super::{Action, Ending, News, Plan, Snapshot, after, images};
 
 /// Where the set is going.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -50,6 +50,7 @@ pub(super) fn decide(
     // Where a fault means the way back, one that is over counts as well.
     let strict = forward && rollout.auto_rollback && !rollout.paused;
     let fault = first_fault(snapshot, crew, (target, strict), now, plan);
+    let fault = fault.or_else(|| images::fault(snapshot, crew, target, now, plan));
     match (&fault, &history.good) {
         (Some((task, fault)), Some(good)) if strict => {
             give_up(target, good, (task, fault), now, plan);
@@ -171,6 +172,9 @@ pub(super) fn change(snapshot: &Snapshot<'_>, crew: &Crew<'_>, course: &Course, 
             continue;
         }
         if rollout.paused || plan.is_full() || allowed == 0 {
+            continue;
+        }
+        if !images::is_there(snapshot, crew, course, plan, member) {
             continue;
         }
         if task.is_placed() {

@@ -1,8 +1,10 @@
 //! The numbers and conditions that people see.
 
 use muster_api::condition::{AVAILABLE, ConditionStatus, PROGRESSING};
+use muster_api::kind::taskset::{Held, TaskSetStatus};
 
 use super::health::Health;
+use super::images;
 use super::places::{Crew, Member};
 use super::rollout::Course;
 use super::{Plan, Snapshot};
@@ -43,7 +45,7 @@ pub(super) fn write(snapshot: &Snapshot<'_>, crew: &Crew<'_>, course: &Course, p
     let most = snapshot.spec.rollout.max_unavailable.of(crew.wanted());
     plan.conditions = vec![
         enough(status.desired_replicas, available, down > number(most)),
-        progress(snapshot, course, plan, arrived),
+        progress(snapshot, course, plan, (arrived, images::awaited(crew, plan))),
     ];
 }
 
@@ -60,18 +62,29 @@ fn enough(desired: u32, available: u32, too_few: bool) -> Said {
     Said { condition: AVAILABLE, status, reason, message }
 }
 
-/// `arrived`: tasks of the revision that all should be of.
-fn progress(snapshot: &Snapshot<'_>, course: &Course, plan: &Plan, arrived: u32) -> Said {
+/// `arrived`: tasks of the revision that all should be of; `awaited`: see [`images::awaited`].
+fn progress(
+    snapshot: &Snapshot<'_>,
+    course: &Course,
+    plan: &Plan,
+    (arrived, awaited): (u32, Option<(bool, String)>),
+) -> Said {
     let say =
         |status, reason, message: String| Said { condition: PROGRESSING, status, reason, message };
+    let (failed, awaited) =
+        awaited.map_or((false, String::new()), |(failed, text)| (failed, format!("; {text}")));
+    let reason = |usual| if failed { "ImagePullBackOff" } else { usual };
     let status = &plan.status;
     let desired = status.desired_replicas;
     let behind = arrived < desired || status.replicas > arrived;
     let still = status.available_replicas < desired;
     let paused = snapshot.spec.rollout.paused;
     if let Some(back) = &status.rolled_back_from {
-        let so_far =
-            if behind { format!(", {arrived} of {desired} are back") } else { String::new() };
+        let so_far = if behind {
+            format!(", {arrived} of {desired} are back{awaited}")
+        } else {
+            String::new()
+        };
         let message =
             format!("{} was given up for {}: {}{so_far}", back.revision, back.to, back.message);
         return say(ConditionStatus::False, "RolledBack", message);
@@ -83,15 +96,7 @@ fn progress(snapshot: &Snapshot<'_>, course: &Course, plan: &Plan, arrived: u32)
         let message = format!("{arrived} of {desired} are of {}", course.target);
         return say(ConditionStatus::Unknown, "Paused", message);
     }
-    let held: Vec<String> = status
-        .held
-        .iter()
-        .map(|h| match h.reason.as_str() {
-            "" => format!("{} by {}", h.node, h.holder),
-            reason => format!("{} by {} ({reason})", h.node, h.holder),
-        })
-        .collect();
-    let held = held.join(", ");
+    let held = held(status);
     let waits = !plan.actions.is_empty() || !status.replacing.is_empty();
     match (course.passed, behind, held.is_empty()) {
         (true, true, false) if !waits => {
@@ -102,7 +107,8 @@ fn progress(snapshot: &Snapshot<'_>, course: &Course, plan: &Plan, arrived: u32)
             if !held.is_empty() {
                 message.push_str(&format!("; under a mission lock: {held}"));
             }
-            say(ConditionStatus::True, "Canary", message)
+            message.push_str(&awaited);
+            say(ConditionStatus::True, reason("Canary"), message)
         }
         (true, true, _) => {
             let mut message = format!("{arrived} of {desired} are of {}", course.target);
@@ -111,7 +117,8 @@ fn progress(snapshot: &Snapshot<'_>, course: &Course, plan: &Plan, arrived: u32)
                 let down = status.unavailable_replicas;
                 message.push_str(&format!("; {down} are down, at most {most} may be"));
             }
-            say(ConditionStatus::True, "Updating", message)
+            message.push_str(&awaited);
+            say(ConditionStatus::True, reason("Updating"), message)
         }
         (true, false, _) if still => {
             let message = format!("{} of {desired} are available", status.available_replicas);
@@ -121,4 +128,13 @@ fn progress(snapshot: &Snapshot<'_>, course: &Course, plan: &Plan, arrived: u32)
             say(ConditionStatus::True, "Complete", format!("all are of {}", course.target))
         }
     }
+}
+
+/// Who keeps which node as it is.
+fn held(status: &TaskSetStatus) -> String {
+    let text = |held: &Held| match held.reason.as_str() {
+        "" => format!("{} by {}", held.node, held.holder),
+        reason => format!("{} by {} ({reason})", held.node, held.holder),
+    };
+    status.held.iter().map(text).collect::<Vec<_>>().join(", ")
 }

@@ -4,6 +4,7 @@ use std::time::Duration;
 
 use jiff::Timestamp;
 use muster_api::condition::{ConditionStatus, READY};
+use muster_api::kind::node::image::ImageStatus;
 use muster_api::kind::node::{MissionLock, Node};
 use muster_api::kind::task::Task;
 use muster_api::kind::taskset::{REVISION_LABEL, TaskTemplate};
@@ -137,6 +138,8 @@ pub struct NodeView {
     pub silent_since: Option<Timestamp>,
     /// Since when it is ready.
     pub ready_since: Option<Timestamp>,
+    /// Images that it was asked to have.
+    pub images: Vec<ImageStatus>,
 }
 
 impl NodeView {
@@ -157,6 +160,7 @@ impl NodeView {
             lock: node.mission_lock(),
             silent_since: since(ConditionStatus::Unknown),
             ready_since: since(ConditionStatus::True),
+            images: node.status.as_ref().map(|s| s.images.clone()).unwrap_or_default(),
         }
     }
 }

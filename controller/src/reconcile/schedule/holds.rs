@@ -69,6 +69,7 @@ impl Scheduler {
     fn look_again_at(&mut self, uids: BTreeSet<TaskUid>) {
         for uid in uids {
             let Some(waiting) = self.waiting.get(&uid) else { continue };
+            self.decided = None;
             let Waiting { stored, demand, past, .. } = waiting;
             let holds = self.holds(&stored.key, &demand.spec, past.as_deref());
             if !holds.is_empty() {
@@ -98,15 +99,16 @@ impl Scheduler {
         self.look_again_at(uids);
     }
 
-    /// Who is considered for a place.
+    /// Who is considered for a place: not who may have one already.
     pub(super) fn placeable(&self) -> impl Iterator<Item = &Waiting> {
-        self.waiting.values().filter(|w| w.holds.is_empty())
+        let waits = |w: &&Waiting| self.cluster.node_of(&w.demand.uid).is_none();
+        self.waiting.values().filter(|w| w.holds.is_empty()).filter(waits)
     }
 
     /// Who is not, with the reasons.
     pub(super) fn held(&self) -> impl Iterator<Item = Wait> {
         let held = self.waiting.values().filter(|w| !w.holds.is_empty());
-        held.map(|w| Wait { uid: w.demand.uid.clone(), why: Arc::clone(&w.holds) })
+        held.map(|w| Wait { uid: w.demand.uid.clone(), why: Arc::clone(&w.holds), brief: false })
     }
 }
 

@@ -6,7 +6,8 @@
 //!   live poses (see `moves`) ──────────▲ whoever moved, as it is now; looked at again are tasks that ask for a place, and offers
 //! ```
 //!
-//! One task owns the cluster, so decisions are made one after the other. A bind is one transaction:
+//! One task owns the cluster, so decisions are made one after the other. They are made when the cluster, a quota or the
+//! waiting tasks have changed, or a time has come: what frameworks and people ask changes mostly nothing of that. A bind is one transaction:
 //! the task's status and the lease it needs, each with the revision it was decided on, while the node is there. When it fails,
 //! the reservation is released and the store's next event brings the task back. What this task wrote
 //! itself is known already, and is passed over when the store tells it.
@@ -23,11 +24,11 @@ use muster_api::id::TaskUid;
 use muster_api::kind::lease::Lease;
 use muster_api::kind::node::Node;
 use muster_api::kind::quota::Quota;
+use muster_api::kind::site::Site;
 use muster_api::kind::task::{NodeRefusal, Task, TaskSpec, TaskStatus};
 use muster_api::name::NodeName;
 use muster_api::phase::TaskPhase;
 use muster_controller_core::cluster::{Cluster, Executor};
-use muster_controller_core::fairness::Accounts;
 use muster_controller_core::ledger::Reservation;
 use muster_controller_core::recent::Recent;
 use muster_controller_core::reschedule;
@@ -35,14 +36,16 @@ use muster_controller_core::schedule::{self, Demand};
 use tokio::sync::{mpsc, oneshot};
 use tokio::time::Instant;
 
+use super::bind::Unsure;
 use super::books::{Books, Page};
 use super::desk::{self, Desk};
 use super::moves::Moves;
 use super::quotas::{Counter, Counts};
-use super::{next_events, watch_from_now};
+use super::{RETRY, next_events, watch_from_now};
 use crate::configs;
 use crate::context::Context;
-use crate::objects::{self, LEASES, NODES, QUOTAS, TASKS};
+use crate::objects::{self, LEASES, NODES, QUOTAS, SITES, TASKS};
+use crate::session::frameworks::owner_of;
 use crate::session::poses::LivePoses;
 use crate::store::{Change, Event, Key, Stored, Watcher};
 use holds::resting_until;
@@ -56,8 +59,8 @@ const QUESTIONS: usize = 1024;
 /// A question to the scheduler.
 #[derive(Debug)]
 enum Question {
-    /// Where would these tasks go now?
-    Plan { tasks: Vec<Demand>, answer: oneshot::Sender<schedule::Plan> },
+    /// Where would these tasks go now, and as of which revision of the store?
+    Plan { tasks: Vec<Demand>, answer: oneshot::Sender<(schedule::Plan, u64)> },
     /// Why does this task wait? All nodes, not only those in its status.
     Why { demand: Demand, answer: oneshot::Sender<Vec<NodeRefusal>> },
     /// Which executors live on a node.
@@ -78,12 +81,13 @@ pub struct Handle {
 pub struct Ended;
 
 impl Handle {
-    /// What the real scheduler would decide for these tasks now, on a copy.
+    /// What the real scheduler would decide for these tasks now, on a copy, and the revision of the store up to which it
+    /// knows everything.
     ///
     /// # Errors
     ///
     /// When the controller ends.
-    pub async fn plan(&self, tasks: Vec<Demand>) -> Result<schedule::Plan, Ended> {
+    pub async fn plan(&self, tasks: Vec<Demand>) -> Result<(schedule::Plan, u64), Ended> {
         let (answer, answered) = oneshot::channel();
         self.questions.send(Question::Plan { tasks, answer }).await.map_err(|_| Ended)?;
         answered.await.map_err(|_| Ended)
@@ -151,6 +155,8 @@ pub struct Scheduler {
     resting: BTreeSet<(Timestamp, TaskUid)>,
     /// When waiting tasks are looked at again even if nothing changes.
     look_again: Option<Instant>,
+    /// The cluster's edition that was decided on; none: waiting tasks have changed since.
+    decided: Option<u64>,
     /// The store failed: robots that move are no reason to try again before.
     binds_after: Option<Instant>,
     specs: Recent<TaskSpec>,
@@ -158,6 +164,10 @@ pub struct Scheduler {
     own: HashSet<u64>,
     /// Nodes whose books changed since the last pass.
     dirty: BTreeSet<NodeName>,
+    /// Every change of the store up to this revision is known.
+    seen: u64,
+    /// Binds that keep what they took until the store says whether they are written.
+    unsure: Vec<Unsure>,
 }
 
 impl Scheduler {
@@ -181,10 +191,13 @@ impl Scheduler {
             dependents: HashMap::new(),
             resting: BTreeSet::new(),
             look_again: None,
+            decided: None,
             binds_after: None,
             specs: Recent::default(),
             own: HashSet::new(),
             dirty: BTreeSet::new(),
+            seen: 0,
+            unsure: Vec::new(),
         };
         (scheduler, Handle { questions: sender })
     }
@@ -192,7 +205,7 @@ impl Scheduler {
     /// Works until dropped.
     pub async fn run(mut self) {
         let mut watcher = self.rebuild().await;
-        self.decide().await;
+        self.decide_if_due().await;
         let mut looking = None;
         loop {
             let desk = self.close_pass().await;
@@ -223,20 +236,24 @@ impl Scheduler {
                 }
                 () = sleep_until(look_again) => {}
             }
-            self.decide().await;
+            self.decide_if_due().await;
         }
     }
 
     /// Looks at everything.
     async fn rebuild(&mut self) -> Watcher {
+        // What is listed is to say what became of them.
+        while self.resolve_unsure().await.is_some() {
+            tokio::time::sleep(RETRY).await;
+        }
         let watcher = watch_from_now(&self.context.store).await;
         let old = std::mem::take(&mut self.cluster);
-        self.desk.begin_anew();
+        self.decided = None;
         self.waiting.clear();
         self.dependents.clear();
         self.resting.clear();
         self.own.clear();
-        for resource in [QUOTAS, NODES, LEASES] {
+        for resource in [QUOTAS, SITES, NODES, LEASES] {
             for stored in self.context.store.list(resource, None).items {
                 self.take_in(resource, Change::Put, &stored);
             }
@@ -255,6 +272,9 @@ impl Scheduler {
             self.cluster.set_executors(&member.name, member.executors.clone());
         }
         self.moves.begin_anew(&mut self.cluster);
+        self.desk.begin_anew(&old, &self.cluster);
+        // What was listed is at least as new.
+        self.seen = watcher.revision();
         tracing::info!(
             nodes = self.cluster.members().count(),
             waiting = self.waiting.len(),
@@ -274,9 +294,10 @@ impl Scheduler {
             match watcher.take() {
                 Ok(more) if !more.is_empty() => events = more,
                 // Fallen behind: the next call of `next` says so.
-                Ok(_) | Err(_) => return,
+                Ok(_) | Err(_) => break,
             }
         }
+        self.seen = watcher.revision();
     }
 
     fn take_in(&mut self, resource: crate::store::Resource, change: Change, stored: &Arc<Stored>) {
@@ -287,6 +308,8 @@ impl Scheduler {
             self.take_in_node(change, stored);
         } else if resource == QUOTAS {
             self.take_in_quota(change, stored);
+        } else if resource == SITES {
+            self.take_in_site(change, stored);
         } else if configs::is_source(resource) {
             self.look_at_holds(&stored.key);
         } else if resource == LEASES && change == Change::Put {
@@ -312,13 +335,19 @@ impl Scheduler {
         // Most changes are the writing of what the namespace has.
         if self.cluster.quota(namespace) != spec.as_ref() {
             self.cluster.set_quota(namespace, spec);
-            self.desk.quotas_changed();
+            self.desk.look_at_all();
         }
     }
 
+    /// Ways are other ones: everything that waits is decided anew after this, and offers are looked at.
+    fn take_in_site(&mut self, change: Change, stored: &Arc<Stored>) {
+        let site = (change == Change::Put).then(|| objects::read::<Site>(stored)).flatten();
+        self.cluster.set_site(&stored.key.name, site.as_ref().map(|site| &site.spec));
+        self.desk.look_at_all();
+    }
+
     fn quota_reason(&self, demand: &Demand) -> Option<NodeRefusal> {
-        let accounts = self.cluster.has_quotas().then(|| Accounts::of(&self.cluster))?;
-        let over = schedule::over_quota(&self.cluster, &accounts, demand)?;
+        let over = schedule::over_quota(&self.cluster, self.cluster.accounts(), demand)?;
         Some(schedule::quota_refusal(&over))
     }
 
@@ -365,6 +394,7 @@ impl Scheduler {
                     spec: self.specs.share(task.spec),
                     since,
                     avoid: avoid.collect(),
+                    framework: owner_of(&task.metadata),
                 };
                 self.take_in_dependencies(&uid, &stored.key, &demand.spec);
                 let past = (!status.earlier.is_empty()).then(|| Box::new(status.carried()));
@@ -377,6 +407,7 @@ impl Scheduler {
                 }
                 // What the namespace asks for changes.
                 self.counter.changed();
+                self.decided = None;
                 let written_at = Instant::now();
                 self.waiting.insert(
                     uid,
@@ -411,6 +442,7 @@ impl Scheduler {
                         groups: Vec::new(),
                         standing,
                         apart,
+                        framework: owner_of(&task.metadata),
                     },
                 );
                 self.dirty.insert(node);
@@ -442,7 +474,8 @@ impl Scheduler {
         // Nobody waits for an answer any more when its receiver is gone; that is no fault.
         match question {
             Question::Plan { mut tasks, answer } => {
-                drop(answer.send(schedule::schedule(&mut self.cluster.clone(), &mut tasks)));
+                let plan = schedule::schedule(&mut self.cluster.clone(), &mut tasks);
+                drop(answer.send((plan, self.seen)));
             }
             Question::Why { demand, answer } => {
                 let held = self.waiting.get(&demand.uid).map(|w| Arc::clone(&w.holds));
@@ -460,19 +493,39 @@ impl Scheduler {
         }
     }
 
-    /// Decides for everything that waits, and carries it out.
-    async fn decide(&mut self) {
-        self.look_again = None;
-        let rested = self.wake_rested();
-        if !self.waiting.is_empty() {
-            let mut demands: Vec<Demand> = self.placeable().map(|w| w.demand.clone()).collect();
-            let mut plan = schedule::schedule(&mut self.cluster, &mut demands);
-            plan.waits.extend(self.held());
-            let binds = self.bind_all(plan.binds).await;
-            let preempted = self.preempt_all(plan.preemptions).await;
-            let waits = self.write_reasons(plan.waits).await;
-            self.look_again = soonest([binds, preempted, waits, rested]);
+    /// Decides when something has changed since the last time, or a time has come.
+    async fn decide_if_due(&mut self) {
+        let unsure = self.resolve_unsure().await;
+        self.desk.begin_pass(&mut self.cluster, !self.waiting.is_empty());
+        let now = Instant::now();
+        let same = self.decided == Some(self.cluster.edition());
+        if same && self.look_again.is_none_or(|at| at > now) {
+            self.look_again = soonest([self.look_again, unsure]);
+            return;
         }
+        self.look_again = unsure;
+        let rested = self.wake_rested();
+        if self.waiting.is_empty() {
+            self.decided = Some(self.cluster.edition());
+        } else {
+            let later = self.decide().await;
+            self.look_again = soonest([unsure, later, rested]);
+        }
+    }
+
+    /// Decides for everything that waits, and carries it out. Says when to look again even if nothing changes.
+    async fn decide(&mut self) -> Option<Instant> {
+        metrics::counter!("muster_decisions_total").increment(1);
+        let mut demands: Vec<Demand> = self.placeable().map(|w| w.demand.clone()).collect();
+        let mut plan = schedule::schedule(&mut self.cluster, &mut demands);
+        // What fails to be written from here on changes it again.
+        self.decided = Some(self.cluster.edition());
+        self.desk.claim(&plan.claims);
+        plan.waits.extend(self.held());
+        let binds = self.bind_all(plan.binds).await;
+        let preempted = self.preempt_all(plan.preemptions).await;
+        let waits = self.write_reasons(plan.waits).await;
+        soonest([binds, preempted, waits])
     }
 
     /// Robots moved: offers follow them at the end of the pass, and tasks that ask for a place may have one now. Why the
@@ -519,3 +572,6 @@ async fn sleep_until(deadline: Option<Instant>) {
         None => std::future::pending().await,
     }
 }
+
+#[cfg(test)]
+mod tests;

@@ -4,16 +4,17 @@ use std::sync::Arc;
 
 use futures::future::join_all;
 use muster_api::id::TaskUid;
-use muster_api::kind::task::{NodeRefusal, PREEMPTING, TaskStatus};
+use muster_api::kind::task::{NodeRefusal, PREEMPTING, Task, TaskStatus};
 use muster_controller_core::preempt::Preemption;
 use muster_controller_core::schedule::{Bind, Wait};
 use tokio::time::Instant;
 use tokio_util::task::AbortOnDropHandle;
 
 use super::{Scheduler, WHY_EVERY};
-use crate::objects;
+use crate::objects::{self, TASKS};
+use crate::reconcile::bind::Unsure;
 use crate::reconcile::{RETRY, bind, preempt};
-use crate::store::{Op, StoreError, Stored};
+use crate::store::{Change, Op, StoreError, Stored};
 
 /// Reasons written in one pass, so that a thousand waiting tasks do not hold up the next bind.
 const WHY_AT_ONCE: usize = 256;
@@ -38,14 +39,17 @@ impl Scheduler {
                     metrics::counter!("muster_binds_total").increment(1);
                     self.waiting.remove(&bind.uid);
                 }
+                Some(Err(error)) if objects::is_race(&error) => {
+                    self.cluster.withdraw(&bind.uid);
+                    // What changed arrives as an event and brings the task back, if it still waits.
+                    tracing::debug!(task = %bind.uid, %error, "a bind came too late");
+                }
                 Some(Err(error)) => {
-                    self.cluster.release(&bind.uid);
-                    if objects::is_race(&error) {
-                        // What changed arrives as an event and brings the task back, if it still waits.
-                        tracing::debug!(task = %bind.uid, %error, "a bind came too late");
-                    } else {
-                        tracing::warn!(task = %bind.uid, error = crate::app::chain(&error), "a bind is not written");
-                        retry = Some(Instant::now() + RETRY);
+                    tracing::warn!(task = %bind.uid, error = crate::app::chain(&error), "a bind is not written");
+                    retry = Some(Instant::now() + RETRY);
+                    if let Some(waiting) = self.waiting.get(&bind.uid) {
+                        self.unsure.push(Unsure { task: waiting.stored.key.clone(), bind });
+                        continue;
                     }
                 }
                 None => {
@@ -57,6 +61,41 @@ impl Scheduler {
         }
         self.binds_after = retry;
         retry
+    }
+
+    /// Asks the store what became of binds that seemed to fail: the disk may have them all the same. Until that is known
+    /// they keep what they took, so that nobody else is given it. Says when to ask again.
+    pub(super) async fn resolve_unsure(&mut self) -> Option<Instant> {
+        if self.unsure.is_empty() && !self.desk.is_unsure() {
+            return None;
+        }
+        if let Err(error) = self.context.store.settled().await {
+            tracing::debug!(
+                error = crate::app::chain(&error),
+                "the store does not know yet what it has"
+            );
+            return Some(Instant::now() + RETRY);
+        }
+        let freed = self.desk.resolve(&mut self.cluster);
+        if !freed.is_empty() {
+            self.counter.changed();
+            self.dirty.extend(freed);
+        }
+        for Unsure { task, bind } in std::mem::take(&mut self.unsure) {
+            let stored = self.context.store.get(&task).filter(|s| *s.uid == *bind.uid.as_str());
+            let placed = stored.as_ref().and_then(|s| objects::read::<Task>(s)?.status?.node);
+            if placed.is_some() {
+                self.waiting.remove(&bind.uid);
+                continue;
+            }
+            self.dirty.extend(self.cluster.withdraw(&bind.uid));
+            // Its changes were passed over while it counted as bound.
+            match stored {
+                Some(stored) => self.take_in(TASKS, Change::Put, &stored),
+                None => self.forget(&bind.uid),
+            }
+        }
+        None
     }
 
     /// Orders the ends of those that make room, each order with its reason in one transaction with the nomination.
@@ -104,11 +143,16 @@ impl Scheduler {
     async fn commit(&self, binds: &[Bind]) -> Vec<Option<Committed>> {
         let mut chunks = Vec::with_capacity(binds.len().div_ceil(CHUNK));
         for chunk in binds.chunks(CHUNK) {
-            let transactions: Vec<Option<Vec<Op>>> =
+            let transactions: Vec<Option<Result<Vec<Op>, StoreError>>> =
                 chunk.iter().map(|bind| self.bind_ops(bind)).collect();
             let store = self.context.store.clone();
             let apply = async move {
-                let apply = |ops: Option<Vec<Op>>| async { Some(store.apply(ops?).await) };
+                let apply = |ops: Option<Result<Vec<Op>, StoreError>>| async {
+                    match ops? {
+                        Ok(ops) => Some(store.apply(ops).await),
+                        Err(error) => Some(Err(error)),
+                    }
+                };
                 join_all(transactions.into_iter().map(apply)).await
             };
             if binds.len() <= CHUNK {
@@ -127,14 +171,17 @@ impl Scheduler {
         results
     }
 
-    /// The bind as one transaction. None: it does not wait any more.
-    fn bind_ops(&self, bind: &Bind) -> Option<Vec<Op>> {
+    /// The bind as one transaction. None: it does not wait any more. An error: the store knows more than this task.
+    fn bind_ops(&self, bind: &Bind) -> Option<Result<Vec<Op>, StoreError>> {
         let waiting = self.waiting.get(&bind.uid)?;
         let now = self.context.clock.now();
         let status = bind::status(bind, waiting.past.as_deref(), now);
         let mut ops = vec![Op::status(&waiting.stored, &status)];
-        ops.extend(bind::grants(&self.context, bind, &waiting.stored.key, now));
-        Some(ops)
+        let grants = bind::grants(&self.context.store, bind, &waiting.stored.key, now);
+        Some(grants.map(|grants| {
+            ops.extend(grants);
+            ops
+        }))
     }
 
     /// Writes why tasks wait, where it is not written yet.
@@ -142,8 +189,12 @@ impl Scheduler {
         let now = Instant::now();
         let mut later = None;
         let mut due = Vec::new();
-        for Wait { uid, why } in waits {
+        for Wait { uid, why, brief } in waits {
             let Some(waiting) = self.waiting.get_mut(&uid) else { continue };
+            if brief && !waiting.written.is_empty() {
+                // What it says is true again in a moment, or it has a place.
+                continue;
+            }
             if waiting.written == why {
                 // One list in memory for all that say the same.
                 waiting.written = why;

@@ -30,6 +30,7 @@ use crate::objects::{self, NODES, QUOTAS, REVISIONS};
 use crate::store::{Change, Key, StoreError, Stored};
 use index::Index;
 use write::Outcome;
+pub(crate) use write::spec_at;
 
 /// When a look could not be carried out because something else refused it (a namespace that ends).
 const LATER: Duration = Duration::from_secs(5);

@@ -7,8 +7,10 @@ use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::{ObjectMeta, OwnerReference, Time};
 use muster_api::condition::{Condition, ConditionStatus, REPLICA_FAILURE, set_condition};
 use muster_api::kind::node::Node;
-use muster_api::kind::task::Task;
-use muster_api::kind::taskset::{CHANGE_CAUSE, SET_LABEL, TaskSet, TaskSetStatus, TaskTemplate};
+use muster_api::kind::task::{Task, TaskSpec};
+use muster_api::kind::taskset::{
+    CHANGE_CAUSE, SET_LABEL, TaskSet, TaskSetSpec, TaskSetStatus, TaskTemplate,
+};
 use muster_api::kind::taskset_revision::{TaskSetRevision, TaskSetRevisionSpec};
 use muster_api::name::NodeName;
 use muster_controller_core::taskset::{Action, NewTask, News, Place, Plan};
@@ -97,6 +99,28 @@ fn say_failure(status: &mut TaskSetStatus, why: Option<&str>, now: Timestamp) {
     };
     let condition = Condition::new(REPLICA_FAILURE, ConditionStatus::True, "FailedCreate", why);
     set_condition(&mut status.conditions, condition, &Time(now));
+}
+
+/// A template's spec with the place of a task of it.
+pub(crate) fn spec_at(
+    set: &TaskSetSpec,
+    name: &str,
+    new: &NewTask,
+    mut spec: TaskSpec,
+) -> TaskSpec {
+    let placement = &mut spec.placement;
+    match &new.place {
+        Place::Anywhere => {}
+        Place::Prefer(node) => placement.prefer = Some(node.clone()),
+        Place::Only(node) => {
+            placement.node = Some(node.clone());
+            placement.prefer = new.follows.then(|| node.clone());
+        }
+    }
+    if set.spread && !set.every_node {
+        placement.apart.get_or_insert_with(|| name.to_owned());
+    }
+    spec
 }
 
 /// What operations are made of.
@@ -226,23 +250,11 @@ impl Work<'_> {
         let set = &*self.stored.key.name;
         let labels = template.labels(set, &new.revision);
         let TaskTemplate { metadata, spec } = template;
-        let mut task = Task::new(&new.name, spec);
+        let mut task = Task::new(&new.name, spec_at(&self.set.spec, set, new, spec));
         task.metadata.namespace = Some(self.namespace().to_owned());
         task.metadata.labels = Some(labels);
         task.metadata.annotations = Some(metadata.annotations).filter(|notes| !notes.is_empty());
         self.own(&mut task.metadata);
-        let placement = &mut task.spec.placement;
-        match &new.place {
-            Place::Anywhere => {}
-            Place::Prefer(node) => placement.prefer = Some(node.clone()),
-            Place::Only(node) => {
-                placement.node = Some(node.clone());
-                placement.prefer = new.follows.then(|| node.clone());
-            }
-        }
-        if self.set.spec.spread && !self.set.spec.every_node {
-            placement.apart.get_or_insert_with(|| set.to_owned());
-        }
         let refusal = match self.create(self.task_key(&new.name), &task) {
             Ok((op, Ok(pass))) => {
                 self.passes.extend(pass);

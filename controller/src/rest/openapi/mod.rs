@@ -2,6 +2,7 @@
 //! `replace` and `edit` read them.
 
 mod operations;
+mod questions;
 mod schemas;
 
 use std::collections::BTreeMap;
@@ -79,7 +80,7 @@ fn make(group: &ApiGroup) -> Value {
         let schema = components.add(entry.info);
         operations::of_kind(entry, &schema, &mut paths);
     }
-    operations::of_group(group, &mut paths);
+    questions::of_group(group, &mut paths);
     json!({
         "openapi": "3.0.0",
         "info": {"title": "muster", "version": env!("CARGO_PKG_VERSION")},
@@ -140,5 +141,37 @@ mod tests {
         let patch = &ours["paths"]["/apis/muster.dev/v1alpha1/namespaces/{namespace}/tasks/{name}"]
             ["patch"];
         assert_eq!(patch["x-kubernetes-group-version-kind"]["kind"], "Task");
+    }
+
+    #[test]
+    fn everything_that_discovery_names_is_in_the_documents() {
+        let has = |group: &ApiGroup, path: &str| {
+            let (document, start) = (make(group), super::path(group));
+            assert!(document["paths"].get(format!("/{start}/{path}")).is_some(), "{start}/{path}");
+        };
+        let core = &GROUPS[0];
+        for sub in ["attach", "eviction", "exec", "log", "status"] {
+            has(core, &format!("namespaces/{{namespace}}/pods/{{name}}/{sub}"));
+        }
+        let ours = &GROUPS[1];
+        let questions =
+            ["check", "join", "jointokens", "offers", "plan", "poses", "transaction", "usage"];
+        for question in questions {
+            has(ours, question);
+        }
+        for sub in ["fence", "pose", "status"] {
+            has(ours, &format!("nodes/{{name}}/{sub}"));
+        }
+        has(ours, "namespaces/{namespace}/tasks/{name}/why");
+        has(ours, "namespaces/{namespace}/tasksets/{name}/scale");
+        for path in ["nodes/{name}", "namespaces/{namespace}/pods/{name}"] {
+            has(&GROUPS[4], path);
+        }
+        let document = make(core);
+        let list = &document["paths"]["/api/v1/pods"]["get"]["parameters"];
+        let named = |name: &str| list.as_array().unwrap().iter().any(|p| p["name"] == name);
+        for parameter in ["watch", "resourceVersion", "timeoutSeconds", "limit", "labelSelector"] {
+            assert!(named(parameter), "{parameter}");
+        }
     }
 }

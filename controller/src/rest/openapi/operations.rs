@@ -2,10 +2,9 @@
 
 use serde_json::{Map, Value, json};
 
-use super::super::discovery::ApiGroup;
-use super::super::metrics_api;
 use super::super::path::Verb;
 use super::super::registry::{Entry, View};
+use super::questions;
 
 const REF: &str = "#/components/schemas/";
 const META: &str = "#/components/schemas/io.k8s.apimachinery.pkg.apis.meta.v1.";
@@ -43,40 +42,7 @@ pub(super) fn of_kind(entry: &Entry, schema: &str, paths: &mut Map<String, Value
         }
         paths.insert(format!("{one}/status"), status);
     }
-    if entry.has_log {
-        let mut log = maker.path(&["name"]);
-        log["get"] = json!({
-            "parameters": [
-                query("container", "string"), query("follow", "boolean"), query("previous", "boolean"),
-                query("sinceSeconds", "integer"), query("tailLines", "integer"),
-                query("timestamps", "boolean"), query("limitBytes", "integer"),
-            ],
-            "responses": {"200": {"description": "The log.", "content": {"text/plain": {"schema": {"type": "string"}}}}},
-        });
-        paths.insert(format!("{one}/log"), log);
-    }
-}
-
-/// The operations of groups without kinds of their own.
-pub(super) fn of_group(group: &ApiGroup, paths: &mut Map<String, Value>) {
-    let root = format!("/apis/{}", group.api_version());
-    let any = json!({"application/json": {"schema": {"type": "object"}}});
-    let answer = json!({"200": {"description": "OK", "content": any}});
-    let questions: &[&str] = match group.name {
-        "authorization.k8s.io" => &["selfsubjectaccessreviews", "selfsubjectrulesreviews"],
-        "authentication.k8s.io" => &["selfsubjectreviews"],
-        metrics_api::GROUP => {
-            for plural in ["nodes", "pods"] {
-                paths.insert(format!("{root}/{plural}"), json!({"get": {"responses": answer}}));
-            }
-            &[]
-        }
-        _ => &[],
-    };
-    for plural in questions {
-        let post = json!({"requestBody": {"content": any}, "responses": {"201": {"description": "Created", "content": any}}});
-        paths.insert(format!("{root}/{plural}"), json!({"post": post}));
-    }
+    questions::of_kind(entry, &one, paths);
 }
 
 struct Maker<'a> {
@@ -88,12 +54,7 @@ impl Maker<'_> {
     /// A path with the parameters that stand in it.
     fn path(&self, more: &[&str]) -> Value {
         let namespace = self.entry.info.namespaced.then_some("namespace");
-        let of = |name: &str| {
-            json!({"name": name, "in": "path", "required": true,
-                   "schema": {"type": "string", "uniqueItems": true}})
-        };
-        let parameters: Vec<Value> = namespace.iter().chain(more).map(|name| of(name)).collect();
-        json!({ "parameters": parameters })
+        json!({ "parameters": in_path(namespace.iter().chain(more).copied()) })
     }
 
     /// Adds the operation of a verb, if the kind has it.
@@ -111,9 +72,14 @@ impl Maker<'_> {
         ];
         let select = [query("labelSelector", "string"), query("fieldSelector", "string")];
         let (method, action, parameters, body, answer) = match verb {
-            Verb::Get => ("get", "get", Vec::new(), None, object),
+            Verb::Get => ("get", "get", vec![query("resourceVersion", "string")], None, object),
             Verb::List | Verb::Watch => {
-                let more = [query("limit", "integer"), query("continue", "string")];
+                let numbers = ["limit", "timeoutSeconds"].map(|name| query(name, "integer"));
+                let flags = ["watch", "allowWatchBookmarks", "sendInitialEvents"];
+                let flags = flags.map(|name| query(name, "boolean"));
+                let texts = ["continue", "resourceVersion", "resourceVersionMatch"];
+                let texts = texts.map(|name| query(name, "string"));
+                let more = numbers.into_iter().chain(flags).chain(texts);
                 ("get", "list", select.into_iter().chain(more).collect(), None, list)
             }
             Verb::Create => ("post", "post", write.to_vec(), Some(self.whole()), object),
@@ -160,12 +126,10 @@ impl Maker<'_> {
     fn patches(&self) -> Value {
         let patch = json!({"schema": {"type": "object"}});
         let mut content = json!({
+            "application/apply-patch+yaml": patch,
             "application/json-patch+json": {"schema": {"type": "array", "items": {"type": "object"}}},
             "application/merge-patch+json": patch,
         });
-        if self.entry.view == View::Stored {
-            content["application/apply-patch+yaml"] = patch.clone();
-        }
         if self.entry.info.group.is_empty() {
             content["application/strategic-merge-patch+json"] = patch;
         }
@@ -173,6 +137,15 @@ impl Maker<'_> {
     }
 }
 
-fn query(name: &str, r#type: &str) -> Value {
+/// Parameters that stand in the path.
+pub(super) fn in_path<'a>(names: impl Iterator<Item = &'a str>) -> Vec<Value> {
+    let of = |name: &str| {
+        json!({"name": name, "in": "path", "required": true,
+               "schema": {"type": "string", "uniqueItems": true}})
+    };
+    names.map(of).collect()
+}
+
+pub(super) fn query(name: &str, r#type: &str) -> Value {
     json!({"name": name, "in": "query", "schema": {"type": r#type, "uniqueItems": true}})
 }

@@ -1,5 +1,7 @@
 //! The launches of an Accept → Task objects that only need their node.
 
+use std::collections::BTreeSet;
+
 use muster_api::id::TaskUid;
 use muster_api::kind::framework::{ACKNOWLEDGE_FINALIZER, FRAMEWORK_LABEL};
 use muster_api::kind::task::Task;
@@ -19,6 +21,30 @@ use crate::rest::failure::Failure;
 use crate::store::{Key, Op};
 use crate::{configs, depends};
 
+/// Sorts of what is wrong with a launch, the one that is hardest to change first: the refusal has its reason.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+enum Fault {
+    /// The spec is refused.
+    Invalid,
+    /// The namespace's quota does not leave it.
+    Quota,
+    /// What it depends on is not there, or not yet: the same launch may pass later.
+    Unmet,
+}
+
+impl Fault {
+    fn reason(self) -> wire::RefusalReason {
+        match self {
+            Fault::Invalid => wire::RefusalReason::Invalid,
+            Fault::Quota => wire::RefusalReason::Quota,
+            Fault::Unmet => wire::RefusalReason::Unavailable,
+        }
+    }
+}
+
+/// What is wrong with one launch.
+type Wrong = (Fault, Vec<wire::Cause>);
+
 /// Checks everything that can be checked without the ledger; all that is wrong is said at once.
 pub(super) fn prepare(
     context: &Context,
@@ -35,13 +61,14 @@ pub(super) fn prepare(
             }]));
         }
     };
-    let (mut prepared, mut causes) = (Vec::new(), Vec::new());
+    let (mut prepared, mut causes, mut faults) = (Vec::new(), Vec::new(), BTreeSet::new());
     for (i, launch) in accept.launches.iter().enumerate() {
         let offer = match (launch.offer.as_str(), accept.offers.as_slice()) {
             ("", [only]) => parse(only),
             (named, _) => parse(named),
         };
         let Some(offer) = offer else {
+            faults.insert(Fault::Invalid);
             causes.push(wire::Cause {
                 field: format!("launches[{i}].offer"),
                 message: "names none of the offers that the call accepts".to_owned(),
@@ -61,25 +88,31 @@ pub(super) fn prepare(
                 offer,
                 _pass: pass,
             }),
-            Err(wrong) => causes.extend(wrong.into_iter().map(|cause| wire::Cause {
-                field: format!("launches[{i}].{}", cause.field),
-                message: cause.message,
-            })),
+            Err((fault, wrong)) => {
+                faults.insert(fault);
+                causes.extend(wrong.into_iter().map(|cause| wire::Cause {
+                    field: format!("launches[{i}].{}", cause.field),
+                    message: cause.message,
+                }));
+            }
         }
     }
-    if causes.is_empty() { Ok((prepared, guard)) } else { Err(convert::invalid(causes)) }
+    match faults.first() {
+        None => Ok((prepared, guard)),
+        Some(fault) => Err(convert::because(fault.reason(), causes)),
+    }
 }
 
-/// The number in an offer's id.
+/// The offer of an id; none: it is none's.
 pub(super) fn parse(id: &str) -> Option<OfferId> {
-    id.parse().ok().map(OfferId)
+    id.parse().ok()
 }
 
 fn task_of(
     context: &Context,
     (framework, uid): (&Key, &FrameworkUid),
     launch: &wire::Launch,
-) -> Result<(Value, Task, Option<Pass>), Vec<wire::Cause>> {
+) -> Result<(Value, Task, Option<Pass>), Wrong> {
     let spec = launch.spec.as_ref().map(json_of).unwrap_or_default();
     let mut labels: serde_json::Map<String, Value> =
         launch.labels.iter().map(|(k, v)| (k.clone(), v.as_str().into())).collect();
@@ -99,22 +132,11 @@ fn task_of(
     let object = json!({
         "apiVersion": muster_api::API_VERSION, "kind": "Task", "metadata": metadata, "spec": spec,
     });
-    let wrong =
-        |field: &str, message: String| vec![wire::Cause { field: field.to_owned(), message }];
-    let refused = |failure: Failure| {
-        let causes = failure.causes();
-        if causes.is_empty() {
-            return wrong("spec", failure.message().to_owned());
-        }
-        causes
-            .into_iter()
-            .map(|(field, message)| wire::Cause {
-                field: field.strip_prefix("metadata.").unwrap_or(&field).to_owned(),
-                message,
-            })
-            .collect()
+    let wrong = |field: &str, message: String| {
+        (Fault::Invalid, vec![wire::Cause { field: field.to_owned(), message }])
     };
-    let object = create::prepare_object(context, TASKS, object).map_err(refused)?;
+    let object = create::prepare_object(context, TASKS, object)
+        .map_err(|failure| (Fault::Invalid, causes_of(&failure)))?;
     let task: Task =
         serde_json::from_value(object.clone()).map_err(|error| wrong("spec", error.to_string()))?;
     let namespace = framework.namespace().unwrap_or_default();
@@ -125,7 +147,7 @@ fn task_of(
             field: hold.field().to_owned(),
             message: format!("{}: {hold}", hold.reason()),
         };
-        return Err(holds.iter().map(cause).collect());
+        return Err((Fault::Unmet, holds.iter().map(cause).collect()));
     }
     if task.spec.placement.node.is_some() {
         return Err(wrong(
@@ -140,6 +162,20 @@ fn task_of(
                 .to_owned(),
         ));
     }
-    let pass = create::pass(context, TASKS, &object).map_err(refused)?;
+    let pass = create::pass(context, TASKS, &object)
+        .map_err(|failure| (Fault::Quota, causes_of(&failure)))?;
     Ok((object, task, pass))
+}
+
+fn causes_of(failure: &Failure) -> Vec<wire::Cause> {
+    let causes = failure.causes();
+    if causes.is_empty() {
+        let message = failure.message().to_owned();
+        return vec![wire::Cause { field: "spec".to_owned(), message }];
+    }
+    let cause = |(field, message): (String, String)| wire::Cause {
+        field: field.strip_prefix("metadata.").unwrap_or(&field).to_owned(),
+        message,
+    };
+    causes.into_iter().map(cause).collect()
 }

@@ -57,16 +57,17 @@ async fn open(State(frameworks): State<Arc<Frameworks>>, request: Request) -> Re
     }
     let (to_session, calls) = Wire::calls();
     let (out, events) = mpsc::channel(OUT);
-    let (feed, body, ended) = (to_session.clone(), request.into_body(), out.clone());
+    let (feed, body, ended) = (to_session.clone(), request.into_body(), out.downgrade());
     frameworks.tasks.spawn(async move {
         let read = tokio::select! {
             read = read_calls(body, &feed) => read,
-            () = ended.closed() => return,
+            // The session is over; nothing here keeps the lines open then.
+            () = feed.closed() => return,
         };
-        if let Err(problem) = read {
+        if let (Err(problem), Some(out)) = (read, ended.upgrade()) {
             let error = wire::Error { reason: "Invalid".to_owned(), message: problem };
             let event = wire::event::Event::Error(error);
-            drop(ended.send(wire::Event { event: Some(event) }).await);
+            drop(out.send(wire::Event { event: Some(event) }).await);
         }
     });
     let wire = Wire { calls, keep_calls: Some(to_session), out };

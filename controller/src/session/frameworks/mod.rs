@@ -29,7 +29,7 @@ mod subscribe;
 pub mod updates;
 
 pub(crate) use session::let_go;
-pub(crate) use subscribe::{owner_of, owning, write_away};
+pub(crate) use subscribe::{owner_of, owning, write_presence};
 
 use std::collections::{BTreeMap, HashMap};
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -39,8 +39,7 @@ use std::time::Duration;
 use muster_api::id::TaskUid;
 use muster_api::kind::task::Task;
 use muster_api::name::NodeName;
-use muster_api::wire::agent::v1::controller_message::Body as ToAgent;
-use muster_api::wire::agent::v1::{ControllerMessage, Message as AgentMessage};
+use muster_api::wire::agent::v1::Message as AgentMessage;
 use muster_api::wire::framework::v1 as wire;
 use muster_controller_core::cluster::Executor;
 use tokio::sync::{Notify, mpsc, oneshot};
@@ -48,9 +47,10 @@ use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
 use super::lock;
+use super::relay::Lost;
 use crate::context::Context;
 use crate::objects;
-use crate::reconcile::desk::{FrameworkUid, Outlet, Request, View};
+use crate::reconcile::desk::{Depth, FrameworkUid, Outlet, Request, View};
 use crate::reconcile::schedule;
 
 /// The generated server side of the session.
@@ -92,6 +92,30 @@ impl Mailbox {
     }
 }
 
+/// Why a message goes to no executor.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Unsent {
+    /// There is none of this framework.
+    NoExecutor(&'static str),
+    /// It cannot be reached now.
+    NotNow(&'static str),
+}
+
+/// What a message says of the task that it comes from or goes to.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Role {
+    /// It registered with its agent, or spoke.
+    Executor,
+    /// A framework takes it for one.
+    Task,
+}
+
+#[derive(Debug)]
+struct Spoken {
+    owner: FrameworkUid,
+    is_executor: bool,
+}
+
 /// An open session.
 #[derive(Debug, Clone)]
 struct Open {
@@ -116,8 +140,8 @@ pub struct Frameworks {
     /// Sessions by the id that their frameworks were told.
     by_session: Mutex<HashMap<String, FrameworkUid>>,
     next_session: AtomicU64,
-    /// Tasks that registered or spoke as executors, and the frameworks that they belong to.
-    executors: Mutex<HashMap<String, FrameworkUid>>,
+    /// Tasks that messages went to or came from, until they end.
+    spoken: Mutex<HashMap<String, Spoken>>,
     roster: roster::Roster,
     doors: direct::Doors,
 }
@@ -139,7 +163,7 @@ impl Frameworks {
             open: Mutex::default(),
             by_session: Mutex::default(),
             next_session: AtomicU64::new(1),
-            executors: Mutex::default(),
+            spoken: Mutex::default(),
             roster: roster::Roster::default(),
             doors: direct::Doors::default(),
         }
@@ -157,6 +181,11 @@ impl Frameworks {
     #[must_use]
     pub fn is_connected(&self, uid: &str) -> bool {
         lock(&self.open).contains_key(uid)
+    }
+
+    /// Whether this is the framework's present session.
+    fn is_session(&self, uid: &str, number: u64) -> bool {
+        lock(&self.open).get(uid).is_some_and(|open| open.outlet.session() == number)
     }
 
     /// Takes a session in; an earlier one of the same framework ends.
@@ -206,9 +235,9 @@ impl Frameworks {
     }
 
     /// What every framework is offered now.
-    pub(crate) async fn look(&self) -> Vec<View> {
+    pub(crate) async fn look(&self, depth: Depth) -> Vec<View> {
         let (answer, answered) = oneshot::channel();
-        match self.scheduler.desk(Request::Look { answer }).await {
+        match self.scheduler.desk(Request::Look { depth, answer }).await {
             Ok(()) => answered.await.unwrap_or_default(),
             // The controller ends.
             Err(_) => Vec::new(),
@@ -219,13 +248,13 @@ impl Frameworks {
     pub(crate) async fn remove(&self, uid: &str) {
         // The desk ends only with the controller.
         let _ = self.scheduler.desk(Request::Remove { uid: uid.into() }).await;
-        lock(&self.executors).retain(|_, owner| **owner != *uid);
+        lock(&self.spoken).retain(|_, spoken| *spoken.owner != *uid);
         self.nobody_dials(&uid.into());
     }
 
     /// From an executor of a node's agent to its framework. At most once: lost when the framework is away.
     pub(crate) fn take_from_executor(&self, node: &NodeName, message: AgentMessage) {
-        let owner = self.owner_of_executor(node, &message.executor);
+        let owner = self.owner_on(node, &message.executor, Role::Executor);
         let Some(owner) = owner else {
             tracing::warn!(%node, executor = message.executor, "a message of no framework's executor is dropped");
             return;
@@ -238,66 +267,77 @@ impl Frameworks {
             return;
         }
         let message = wire::Message { executor, node: node.to_string(), data, mark };
-        self.say(&owner, wire::event::Event::Message(message));
+        if mark != 0 {
+            // What comes after it goes another way: without it nothing would.
+            return self.say(&owner, wire::event::Event::Message(message));
+        }
+        let outlet = lock(&self.open).get(&*owner).map(|open| open.outlet.clone());
+        if outlet.is_some_and(|outlet| !outlet.relay(message)) {
+            tracing::warn!(%node, framework = %owner, "a message is lost: the framework does not keep up");
+        }
     }
 
     /// Those of a node's executors that are a framework's.
     pub(crate) fn executors_on(&self, node: &NodeName, uids: &[String]) -> Vec<Executor> {
         let executor = |uid: &String| {
-            let framework = self.owner_of_executor(node, uid)?;
+            let framework = self.owner_on(node, uid, Role::Executor)?;
             let (_, key) = self.agents.board().find(uid)?;
             Some(Executor { uid: TaskUid::new(uid.as_str()), name: (*key.name).into(), framework })
         };
         uids.iter().filter_map(executor).collect()
     }
 
-    /// The framework of a task on this node; remembered, so that a stream of messages reads no objects.
-    fn owner_of_executor(&self, node: &NodeName, uid: &str) -> Option<FrameworkUid> {
+    /// The framework of a task on this node; remembered while it lives, so that a stream of messages reads no objects.
+    fn owner_on(&self, node: &NodeName, uid: &str, role: Role) -> Option<FrameworkUid> {
         let (placed_on, key) = self.agents.board().find(uid)?;
         if placed_on != *node {
             return None;
         }
-        if let Some(owner) = lock(&self.executors).get(uid) {
-            return Some(Arc::clone(owner));
+        // Locked while the store is asked: whoever forgets it looks after the store has said that it ended.
+        let mut all = lock(&self.spoken);
+        if let Some(spoken) = all.get_mut(uid) {
+            spoken.is_executor |= role == Role::Executor;
+            return Some(Arc::clone(&spoken.owner));
         }
         let task: Task = objects::read(&*self.context.store.get(&key)?)?;
         let owner = owner_of(&task.metadata)?;
-        lock(&self.executors).insert(uid.to_owned(), Arc::clone(&owner));
+        if objects::uid_of(&task.metadata) == uid
+            && task.status.is_some_and(|status| status.phase.holds_node())
+        {
+            let is_executor = role == Role::Executor;
+            all.insert(uid.to_owned(), Spoken { owner: Arc::clone(&owner), is_executor });
+        }
         Some(owner)
     }
 
     /// To an executor. At most once: lost when its node is away.
-    fn send_to_executor(
-        &self,
-        framework: &str,
-        message: wire::Message,
-    ) -> Result<(), &'static str> {
+    fn send_to_executor(&self, framework: &str, message: wire::Message) -> Result<(), Unsent> {
         let uid = &message.executor;
-        let (node, _) = self.agents.board().find(uid).ok_or("there is no such executor")?;
-        let owner = self.owner_of_executor(&node, uid);
+        let found = self.agents.board().find(uid);
+        let (node, _) = found.ok_or(Unsent::NoExecutor("there is no such executor"))?;
+        let owner = self.owner_on(&node, uid, Role::Task);
         if owner.is_none_or(|owner| *owner != *framework) {
-            return Err("the executor is another framework's");
+            return Err(Unsent::NoExecutor("the executor is another framework's"));
         }
-        let connection = self.agents.connection(&node).ok_or("its node is not connected")?;
+        let connection = self.agents.connection(&node);
+        let connection = connection.ok_or(Unsent::NotNow("its node is not connected"))?;
         let wire::Message { executor, data, mark, .. } = message;
         if mark == 0 {
             direct::count("to_executor");
         }
-        let body = ToAgent::Message(AgentMessage { executor, data, mark });
-        let message = ControllerMessage { body: Some(body) };
-        connection
-            .outbound
-            .try_send(message)
-            .map_err(|_| "its node does not keep up with what it is sent")
+        connection.relay.send(AgentMessage { executor, data, mark }).map_err(|lost| {
+            Unsent::NotNow(match lost {
+                Lost::NoWay => "its node takes no messages at the moment",
+                Lost::TooMuch => "its node does not keep up with what it is sent",
+            })
+        })
     }
 
-    pub(crate) fn is_executor(&self, uid: &str) -> bool {
-        lock(&self.executors).contains_key(uid)
-    }
-
-    pub(crate) fn forget_executor(&self, uid: &str) {
-        lock(&self.executors).remove(uid);
+    /// A task has ended. Says whether it was an executor.
+    pub(crate) fn forget_executor(&self, uid: &str) -> bool {
+        let spoken = lock(&self.spoken).remove(uid);
         self.not_dialled(uid);
+        spoken.is_some_and(|spoken| spoken.is_executor)
     }
 
     fn calls_of(&self, session_id: &str) -> Option<mpsc::Sender<wire::Call>> {

@@ -39,6 +39,11 @@ impl Roster {
         lock(&self.0).insert(stored.uid.clone(), entry);
     }
 
+    /// The key of a task, and whose it is.
+    pub(super) fn find(&self, uid: &str) -> Option<(Key, Option<FrameworkUid>)> {
+        lock(&self.0).get(uid).map(|entry| (entry.key.clone(), entry.framework.clone()))
+    }
+
     pub(super) fn remove(&self, uid: &str) {
         lock(&self.0).remove(uid);
     }

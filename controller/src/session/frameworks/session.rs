@@ -26,7 +26,7 @@ use wire::event::Event as Tell;
 
 use super::subscribe::{self, Guest};
 use super::{
-    CALLS, EVENTS, Frameworks, HEARTBEAT_EVERY, MAX_MESSAGE, Mailbox, Open, convert, launch,
+    CALLS, EVENTS, Frameworks, HEARTBEAT_EVERY, MAX_MESSAGE, Mailbox, Open, Unsent, convert, launch,
 };
 use crate::objects::{self, TASKS};
 use crate::reconcile::desk::{Outlet, Request};
@@ -115,6 +115,12 @@ async fn serve(frameworks: Arc<Frameworks>, wire: Wire, guest: Guest) {
     let direct = session.guest.direct;
     let open = Open { outlet: outlet.clone(), direct, mailbox, calls, cut: cut.clone() };
     frameworks.connect(&uid, &session_id, open);
+    // After it is taken in: whoever writes that it is away looks first whether it is.
+    let written = subscribe::write_connected(&frameworks, &session.guest, number).await;
+    if let Err(subscribe::Refused(reason, message)) = written {
+        refuse(&session.out, reason, &message).await;
+        return session.leave(&session_id).await;
+    }
     let ended = {
         let worked = pin!(session.work(&session_id, outlet, wire.calls, &mut told));
         tokio::select! {
@@ -126,11 +132,7 @@ async fn serve(frameworks: Arc<Frameworks>, wire: Wire, guest: Guest) {
         }
     };
     if cut.is_cancelled() {
-        refuse_quickly(
-            &session.out,
-            "Cut",
-            "a later session of this framework began, or it was removed",
-        );
+        refuse_quickly(&session.out, "Cut", subscribe::LATER);
     }
     tracing::info!(framework = %key, torn_down = ended.is_ok(), "framework's session ended");
     session.leave(&session_id).await;
@@ -162,7 +164,7 @@ impl Session {
             uid: Arc::clone(&self.guest.uid),
             key: self.guest.key.clone(),
             spec: Box::new(self.guest.spec.clone()),
-            outlet,
+            outlet: outlet.clone(),
         })
         .await?;
         self.frameworks.may_dial(&self.guest.uid, self.number, self.guest.direct);
@@ -178,7 +180,10 @@ impl Session {
                     None => return Err(Closed),
                 },
                 // Cancel safe, as above.
-                Some(event) = told.recv() => self.send(event).await?,
+                Some(event) = told.recv() => {
+                    outlet.taken(&event);
+                    self.send(event).await?;
+                }
                 // Cancel safe: the permit stays.
                 () = self.mailbox.wake.notified() => {
                     for (_, update) in self.mailbox.take() {
@@ -209,10 +214,11 @@ impl Session {
     }
 
     async fn answer(&self, id: String, refusal: Option<wire::Refusal>) -> Result<(), Closed> {
-        if id.is_empty() {
+        let answer = wire::Answer { id, refusal, launched: Vec::new() };
+        if !convert::is_wanted(&answer) {
             return Ok(());
         }
-        self.say(Tell::Answer(wire::Answer { id, refusal, launched: Vec::new() })).await
+        self.say(Tell::Answer(answer)).await
     }
 
     /// Every task of the framework whose end it has not acknowledged.
@@ -333,6 +339,12 @@ impl Session {
     }
 
     async fn accept(&self, id: String, accept: &wire::Accept) -> Result<(), Closed> {
+        // One that cannot be read is one that is not offered.
+        let unread: Vec<String> =
+            accept.offers.iter().filter(|id| launch::parse(id).is_none()).cloned().collect();
+        if !unread.is_empty() {
+            return self.answer(id, Some(convert::offers_gone(unread))).await;
+        }
         let owner = (&self.guest.key, &self.guest.uid);
         let prepared = launch::prepare(&self.frameworks.context, owner, accept);
         let (launches, guard) = match prepared {
@@ -342,29 +354,30 @@ impl Session {
         let Some(refuse) = refuse_time(accept.refuse_seconds) else {
             return self.answer(id, Some(invalid("accept.refuseSeconds", "is not a time"))).await;
         };
-        // One that cannot be read is one that is not offered.
-        let none = muster_controller_core::offer::OfferId(0);
-        let offers = accept.offers.iter().map(|id| launch::parse(id).unwrap_or(none)).collect();
-        let uid = Arc::clone(&self.guest.uid);
-        self.ask(Request::Accept { uid, call: id, offers, launches, refuse, guard }).await
+        let offers = accept.offers.iter().filter_map(|id| launch::parse(id)).collect();
+        let (uid, session) = (Arc::clone(&self.guest.uid), self.number);
+        self.ask(Request::Accept { uid, session, call: id, offers, launches, refuse, guard }).await
     }
 
     /// The key of one of the framework's tasks.
     fn find(&self, uid: &str) -> Option<Key> {
-        let placed = self.frameworks.agents.board().find(uid).and_then(|(_, key)| {
-            let stored = self.frameworks.context.store.get(&key)?;
-            let task = (*stored.uid == *uid).then(|| objects::read::<Task>(&stored)).flatten()?;
-            subscribe::owner_of(&task.metadata).filter(|owner| *owner == self.guest.uid)?;
-            Some(key)
-        });
-        // The board is a moment behind: one that was just launched may not be on it yet.
-        placed.or_else(|| self.look_for(uid))
+        match self.frameworks.roster().find(uid) {
+            Some((key, owner)) => {
+                // By now another task may have the name.
+                let stored = self.frameworks.context.store.get(&key)?;
+                (owner? == self.guest.uid && *stored.uid == *uid).then_some(key)
+            }
+            // The roster is a moment behind: one that was just launched may not be on it yet.
+            None => self.look_for(uid),
+        }
     }
 
+    /// Looks at the uids of all tasks of the namespace, and reads one.
     fn look_for(&self, uid: &str) -> Option<Key> {
-        let tasks = self.tasks();
-        let found = tasks.iter().find(|(_, t)| objects::uid_of(&t.metadata) == uid);
-        found.map(|(_, task)| objects::task_key(task))
+        let tasks = self.frameworks.context.store.list(TASKS, self.guest.key.namespace()).items;
+        let stored = tasks.into_iter().find(|stored| *stored.uid == *uid)?;
+        let owner = subscribe::owner_of(&objects::read::<Task>(&stored)?.metadata)?;
+        (owner == self.guest.uid).then(|| stored.key.clone())
     }
 
     async fn kill(&self, kill: &wire::Kill) -> Option<wire::Refusal> {
@@ -388,8 +401,13 @@ impl Session {
             // Acknowledged before, or a newer state is on its way.
             return None;
         };
-        let ended = is_end(update.state);
-        if ended && let Some(key) = self.find(&acknowledge.task) {
+        if is_end(update.state) {
+            // The update says where it is; `let_go` looks at the uid.
+            let key = Key::namespaced(
+                TASKS,
+                self.guest.key.namespace().unwrap_or_default(),
+                &*update.name,
+            );
             let store = &self.frameworks.context.store;
             if let Err(error) = let_go(store, &key, &acknowledge.task).await {
                 // It is said again, and acknowledged again.
@@ -426,7 +444,10 @@ impl Session {
             return Some(invalid("message.data", &text));
         }
         let sent = self.frameworks.send_to_executor(&self.guest.uid, message);
-        sent.err().map(|why| convert::not_found(why.to_owned()))
+        sent.err().map(|unsent| match unsent {
+            Unsent::NoExecutor(why) => convert::not_found(why.to_owned()),
+            Unsent::NotNow(why) => convert::not_now(why.to_owned()),
+        })
     }
 
     /// Removes the framework's object; the collector of garbage ends its tasks.
@@ -449,8 +470,7 @@ impl Session {
         let leave = Request::Leave { uid: Arc::clone(&guest.uid), session: number };
         let _ = frameworks.scheduler.desk(leave).await;
         if frameworks.disconnect(&guest.uid, session_id, number)
-            && let Err(error) =
-                subscribe::write_away(&frameworks.context, &guest.key, &guest.uid).await
+            && let Err(error) = subscribe::write_presence(&frameworks, &guest.key, &guest.uid).await
         {
             // The failover loop finds it connected and without a session, and writes it again.
             tracing::warn!(framework = %guest.key, error = crate::app::chain(&error), "an absence is not written yet");

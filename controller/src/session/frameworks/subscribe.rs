@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::{MicroTime, ObjectMeta, OwnerReference};
-use muster_api::kind::framework::{Framework, FrameworkSpec};
+use muster_api::kind::framework::{Framework, FrameworkSpec, NONCE_ANNOTATION};
 use muster_api::kind::namespace::DEFAULT;
 use muster_api::name::check_name;
 use muster_api::wire::framework::v1 as wire;
@@ -15,6 +15,9 @@ use crate::objects::{self, FRAMEWORKS};
 use crate::reconcile::desk::FrameworkUid;
 use crate::rest::create;
 use crate::store::{Key, Stored};
+
+/// Longest nonce: a random UUID has 36 characters.
+const MAX_NONCE: usize = 64;
 
 /// A framework that may go on.
 #[derive(Debug)]
@@ -32,11 +35,15 @@ pub(super) struct Guest {
 #[derive(Debug)]
 pub(super) struct Refused(pub(super) &'static str, pub(super) String);
 
+/// What a session is told that has to go.
+pub(super) const LATER: &str = "a later session of this framework began, or it was removed";
+
 fn invalid(message: impl std::fmt::Display) -> Refused {
     Refused("Invalid", message.to_string())
 }
 
-/// Registers a framework, or takes it up again where it was.
+/// Registers a framework, or finds it where it was. That it is connected is written by [`write_connected`], after its session
+/// has been taken in.
 ///
 /// # Errors
 ///
@@ -56,7 +63,7 @@ pub(super) async fn subscribe(
     let namespace = if call.namespace.is_empty() { DEFAULT } else { &call.namespace };
     let key = Key::namespaced(FRAMEWORKS, namespace, call.name.as_str());
     let Some(stored) = context.store.get(&key) else {
-        let registered = register(context, key, spec, &call.framework_id).await?;
+        let registered = register(context, key, spec, call).await?;
         return Ok(Guest { direct: call.direct, ..registered });
     };
     if stored.mentions("deletionTimestamp") {
@@ -65,15 +72,23 @@ pub(super) async fn subscribe(
             format!("{key} is being removed; subscribe again when it is gone"),
         ));
     }
-    if call.framework_id.is_empty() {
+    // For it, it is registered now.
+    let unheard = call.framework_id.is_empty() && is_of_this_run(&stored, &call.nonce);
+    if call.framework_id.is_empty() && !unheard {
         return Err(Refused("AlreadyExists", in_the_way(frameworks, &key, &stored)));
     }
-    if *stored.uid != *call.framework_id {
+    if *stored.uid != *call.framework_id && !unheard {
         return Err(gone(&call.framework_id));
     }
     let uid: FrameworkUid = (*stored.uid).into();
-    write_connected(context, &key, &uid, Some(&spec)).await?;
-    Ok(Guest { uid, key, spec, returned: true, direct: call.direct })
+    Ok(Guest { uid, key, spec, returned: !unheard, direct: call.direct })
+}
+
+/// Whether the framework was registered by this run of it, which has not heard of that.
+fn is_of_this_run(stored: &Stored, nonce: &str) -> bool {
+    let object = objects::read::<Framework>(stored);
+    let annotations = object.and_then(|object| object.metadata.annotations).unwrap_or_default();
+    !nonce.is_empty() && annotations.get(NONCE_ANNOTATION).is_some_and(|known| known == nonce)
 }
 
 fn in_the_way(frameworks: &Frameworks, key: &Key, stored: &Stored) -> String {
@@ -99,39 +114,51 @@ async fn register(
     context: &Context,
     key: Key,
     spec: FrameworkSpec,
-    id: &str,
+    call: &wire::Subscribe,
 ) -> Result<Guest, Refused> {
-    if !id.is_empty() {
-        return Err(gone(id));
+    if !call.framework_id.is_empty() {
+        return Err(gone(&call.framework_id));
+    }
+    if call.nonce.len() > MAX_NONCE {
+        return Err(invalid(format!("nonce: is longer than {MAX_NONCE} bytes")));
     }
     let mut object = Framework::new(&key.name, spec.clone());
     object.metadata.namespace = key.namespace().map(str::to_owned);
+    if !call.nonce.is_empty() {
+        let nonce = (NONCE_ANNOTATION.to_owned(), call.nonce.clone());
+        object.metadata.annotations = Some([nonce].into());
+    }
     let created = create::create_object(context, FRAMEWORKS, objects::to_value(&object)).await;
     let stored = created.map_err(|failure| match failure.code() {
-        409 => Refused("AlreadyExists", format!("a framework {} exists", key.name)),
+        // Perhaps by an earlier try of the same run: the next one finds it, and whose it is.
+        409 => Refused("Unavailable", format!("a framework {} was just registered", key.name)),
         404 | 403 => invalid(failure.message()),
         _ => Refused("Unavailable", failure.message().to_owned()),
     })?;
     let uid: FrameworkUid = (*stored.uid).into();
-    write_connected(context, &key, &uid, None).await?;
     Ok(Guest { uid, key, spec, returned: false, direct: false })
 }
 
-/// Writes that a session is open.
-async fn write_connected(
-    context: &Context,
-    key: &Key,
-    uid: &FrameworkUid,
-    spec: Option<&FrameworkSpec>,
+/// Writes that a session is open, and what the framework wants in it. The session is the framework's present one when this
+/// is called: an absence of an earlier one that is written late finds it and writes nothing.
+///
+/// # Errors
+///
+/// What the framework is told before its session ends.
+pub(super) async fn write_connected(
+    frameworks: &Frameworks,
+    guest: &Guest,
+    number: u64,
 ) -> Result<(), Refused> {
+    let Guest { uid, key, spec, .. } = guest;
+    let context = &frameworks.context;
     let now = context.clock.now();
     let written = objects::change(&context.store, key, |stored, mut object: Framework| {
-        if *stored.uid != **uid {
+        // A later session writes what it wants itself.
+        if *stored.uid != **uid || !frameworks.is_session(uid, number) {
             return None;
         }
-        if let Some(spec) = spec {
-            object.spec = spec.clone();
-        }
+        object.spec = spec.clone();
         let status = object.status.get_or_insert_default();
         status.connected = true;
         status.suppressed = false;
@@ -142,7 +169,8 @@ async fn write_connected(
     .await;
     match written {
         Ok(Some(_)) => Ok(()),
-        Ok(None) => Err(gone(uid)),
+        Ok(None) if frameworks.is_session(uid, number) => Err(gone(uid)),
+        Ok(None) => Err(Refused("Cut", LATER.to_owned())),
         Err(error) => Err(Refused("Unavailable", crate::app::chain(&error))),
     }
 }
@@ -167,25 +195,32 @@ pub(super) async fn write_spec(
     }
 }
 
-/// Writes that a framework is away from now on: its failover timeout runs.
+/// Writes whether a framework has a session, where its object says something else. Without one it is away from now on.
 ///
 /// # Errors
 ///
 /// When the store fails.
-pub(crate) async fn write_away(
-    context: &Context,
+pub(crate) async fn write_presence(
+    frameworks: &Frameworks,
     key: &Key,
     uid: &str,
 ) -> Result<(), crate::store::StoreError> {
+    let context = &frameworks.context;
     let now = context.clock.now();
     objects::change(&context.store, key, |stored, mut object: Framework| {
         let status = object.status.get_or_insert_default();
-        if *stored.uid != *uid || !status.connected {
+        // At every try: a session may have begun since, and what it writes must not be undone.
+        let connected = frameworks.is_connected(uid);
+        if *stored.uid != *uid || status.connected == connected {
             return None;
         }
-        status.connected = false;
-        status.offers = 0;
-        status.disconnected_at = Some(MicroTime(now));
+        status.connected = connected;
+        if connected {
+            status.disconnected_at = None;
+        } else {
+            status.offers = 0;
+            status.disconnected_at = Some(MicroTime(now));
+        }
         Some(vec![objects::replace(stored, &object)])
     })
     .await

@@ -74,8 +74,9 @@ fn tell(frameworks: &Frameworks, stored: &crate::store::Stored, change: Change) 
         frameworks.put_update(&framework, convert::update(&task, stored.revision));
     }
     let status = task.status.unwrap_or_default();
-    let is_executor = frameworks.is_executor(stored.uid.as_ref());
-    if is_executor && matches!(status.phase, TaskPhase::Succeeded | TaskPhase::Failed) {
+    let has_ended = change == Change::Delete
+        || matches!(status.phase, TaskPhase::Succeeded | TaskPhase::Failed);
+    if has_ended && frameworks.forget_executor(stored.uid.as_ref()) {
         let lost = wire::ExecutorLost {
             executor: stored.uid.to_string(),
             node: status.node.unwrap_or_default(),
@@ -83,6 +84,5 @@ fn tell(frameworks: &Frameworks, stored: &crate::store::Stored, change: Change) 
             message: status.message,
         };
         frameworks.say(&framework, wire::event::Event::ExecutorLost(lost));
-        frameworks.forget_executor(stored.uid.as_ref());
     }
 }

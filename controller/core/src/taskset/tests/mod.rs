@@ -1,5 +1,6 @@
 //! The rules one by one.
 
+mod images;
 mod model;
 mod world;
 

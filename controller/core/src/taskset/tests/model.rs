@@ -22,6 +22,8 @@ enum Event {
     /// Somebody deletes a task.
     Delete(usize),
     Reboot(usize),
+    /// Images can be pulled, or not.
+    Registry(bool),
     Pass(usize),
 }
 
@@ -38,6 +40,7 @@ fn event() -> impl Strategy<Value = Event> {
         1 => (0..6_usize).prop_map(Event::End),
         1 => (0..6_usize).prop_map(Event::Delete),
         1 => (0..6_usize).prop_map(Event::Reboot),
+        1 => any::<bool>().prop_map(Event::Registry),
         4 => (1..8_usize).prop_map(Event::Pass),
     ]
 }
@@ -74,6 +77,7 @@ fn apply(world: &mut World, event: &Event) {
             }
         }
         Event::End(_) | Event::Delete(_) | Event::Reboot(_) => {}
+        Event::Registry(on) => world.no_registry = !on,
         Event::Pass(steps) => world.steps(*steps),
     }
 }
@@ -87,6 +91,7 @@ fn heal(world: &mut World) {
         world.node(&name).facts.unschedulable = false;
     }
     world.spec.rollout.paused = false;
+    world.no_registry = false;
 }
 
 /// Per place: an end and a beginning for the new template, the same back, and one for what was in between.
@@ -102,7 +107,7 @@ proptest! {
     fn it_converges_from_anywhere(
         every_node in any::<bool>(),
         replace in any::<bool>(),
-        auto in any::<bool>(),
+        (auto, containers) in (any::<bool>(), any::<bool>()),
         (canary, most) in (0..3_u32, 1..4_u32),
         events in proptest::collection::vec(event(), 0..40),
     ) {
@@ -118,6 +123,9 @@ proptest! {
             }
         }
         let mut world = World::new(spec, 4);
+        if containers {
+            world.use_containers();
+        }
         for event in &events {
             apply(&mut world, event);
             world.decide();
@@ -137,12 +145,15 @@ proptest! {
         prop_assert_eq!(there, wanted);
         let bad = is_bad(&world.spec.template);
         let good = world.revisions.iter().find(|r| r.name == world.status.current_revision);
-        if let (true, true, Some(good)) = (bad, auto, good) {
+        // While images could not be pulled, a good template was given up as well, and stays so.
+        let back = world.status.rolled_back_from.as_ref();
+        let unhad = back.is_some_and(|back| back.reason == "ImagePullFailed");
+        if let (true, true, Some(good)) = (bad || unhad, auto, good) {
             let number = good.template.metadata.annotations["number"].clone();
             prop_assert!(!is_bad(&good.template), "a bad template was called good");
             prop_assert!(world.templates().iter().all(|t| *t == number), "{:?}", world.templates());
         }
-        if !bad {
+        if !bad && !unhad {
             let number = &world.spec.template.metadata.annotations["number"];
             prop_assert!(world.templates().iter().all(|t| t == number), "{:?}: {:#?}", world.templates(), world.status);
             let placed = wanted.min(world.nodes.len());

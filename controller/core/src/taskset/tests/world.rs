@@ -5,6 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
 use jiff::{SignedDuration, Timestamp};
+use muster_api::kind::node::image::{ImagePhase, ImageStatus};
 use muster_api::kind::node::{MissionLock, Node, NodeKind};
 use muster_api::kind::taskset::{TaskSetSpec, TaskSetStatus, TaskTemplate, UnreachablePolicy};
 use muster_api::phase::TaskPhase;
@@ -44,6 +45,10 @@ pub(super) struct World {
     pub(super) tasks: Vec<TaskView>,
     pub(super) nodes: BTreeMap<String, NodeView>,
     pub(super) taken: BTreeSet<String>,
+    /// Templates are of containers, each with an image of its own.
+    pub(super) containers: bool,
+    /// No image can be pulled.
+    pub(super) no_registry: bool,
     pub(super) now: Timestamp,
     /// Of all plans so far.
     pub(super) actions: Vec<Action>,
@@ -64,6 +69,8 @@ impl World {
             tasks: Vec::new(),
             nodes: BTreeMap::new(),
             taken: BTreeSet::new(),
+            containers: false,
+            no_registry: false,
             now: Timestamp::from_second(1_000_000).expect("in range"),
             actions: Vec::new(),
             last: None,
@@ -116,8 +123,23 @@ impl World {
         }
     }
 
+    /// From now on, and what is there already.
+    pub(super) fn use_containers(&mut self) {
+        self.containers = true;
+        self.spec.template = self.template(0);
+    }
+
+    fn template(&self, number: u32) -> TaskTemplate {
+        let mut template = template(number);
+        if self.containers {
+            let run = json!({"container": {"image": format!("img:{number}")}});
+            template.spec.run = serde_json::from_value(run).expect("a run");
+        }
+        template
+    }
+
     pub(super) fn set_template(&mut self, number: u32) {
-        let new = template(number);
+        let new = self.template(number);
         if self.spec.template != new {
             self.spec.template = new;
             self.generation += 1;
@@ -181,6 +203,46 @@ impl World {
             }
         }
         self.place();
+        self.pull();
+    }
+
+    /// What agents do about the images that they are told of: each takes a while.
+    fn pull(&mut self) {
+        let no_registry = self.no_registry;
+        for (name, node) in self.nodes.iter_mut().filter(|(_, n)| n.facts.not_ready.is_none()) {
+            let before = std::mem::take(&mut node.images);
+            for pull in self.status.image_pulls.iter().filter(|pull| pull.node == *name) {
+                let known = before.iter().find(|image| image.wish == pull.wish);
+                let (phase, message) = match known.map(|image| image.phase) {
+                    None => (ImagePhase::Pulling, ""),
+                    Some(ImagePhase::Pulled) => (ImagePhase::Pulled, ""),
+                    Some(_) if no_registry => (ImagePhase::BackOff, "no route to the registry"),
+                    Some(_) => (ImagePhase::Pulled, ""),
+                };
+                node.images.push(ImageStatus {
+                    wish: pull.wish.clone(),
+                    phase,
+                    reason: String::new(),
+                    message: message.to_owned(),
+                    failures: 0,
+                });
+            }
+        }
+    }
+
+    /// A node has what a template needs, or it needs nothing.
+    fn has_image(&self, task: &TaskView, revision: &str) -> bool {
+        let image = |name: &str| {
+            let revision = self.revisions.iter().find(|r| r.name == name)?;
+            Some(revision.template.spec.run.container.as_ref()?.image.clone())
+        };
+        let node = task.node.as_ref().map(|node| &self.nodes[node]);
+        let pulled = |wanted: &String| {
+            let has = |i: &ImageStatus| i.wish.image == *wanted && i.phase == ImagePhase::Pulled;
+            node.is_some_and(|node| node.images.iter().any(has))
+        };
+        image(revision)
+            .is_none_or(|wanted| image(&task.revision).as_ref() == Some(&wanted) || pulled(&wanted))
     }
 
     /// The scheduler: each on a node of its own.
@@ -299,6 +361,8 @@ impl World {
                         assert_ne!(task.phase, TaskPhase::Unknown, "nobody knows what it does");
                         assert_ne!(*revision, task.revision);
                         assert!(!self.spec.rollout.paused, "changed while paused");
+                        let ready = !served || self.has_image(task, revision);
+                        assert!(ready, "its node has not what follows: {action:?}");
                         // What has no place was not taken down.
                         let first = |t: &&TaskView| {
                             let taken = matches!(t.refusal.as_deref(), Some("Apart" | "LeaseHeld"));
