@@ -38,6 +38,7 @@ mod board;
 mod capacity;
 mod checkpoint;
 mod clock;
+mod companion;
 pub mod config;
 mod contact;
 mod declared;

@@ -6,9 +6,8 @@
 use std::collections::BTreeMap;
 use std::fs::{self, File};
 use std::os::unix::fs::DirBuilderExt as _;
-use std::os::unix::process::CommandExt as _;
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Stdio};
+use std::process::Child;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
@@ -22,19 +21,14 @@ use tokio::sync::watch;
 
 use super::settings::{self, Settings};
 use super::{AGENT_SOCKET, LOG, TASKS_DIR, VERB};
+use crate::companion::{self, Kept};
 use crate::driver::chain;
 use crate::durable::{self, FileError, Keep};
 use crate::executor::frame;
 use crate::runtime::process::Reexec;
 
-/// Between two looks for a gate that is not there. The robot stands meanwhile, so it is short.
-const AGAIN: Duration = Duration::from_millis(20);
-
 /// The agent says what it wants at least so often; see `hall`'s `STUCK`.
 const SAY_EVERY: Duration = Duration::from_secs(1);
-
-/// Between two starts of a gate that ends before it can be asked anything.
-const START_AGAIN: Duration = Duration::from_millis(200);
 
 /// An agent that goes down in order is back within this, or the robot is stopped: the time of an upgrade.
 const LEAVES_FOR: Duration = Duration::from_secs(10);
@@ -42,8 +36,7 @@ const LEAVES_FOR: Duration = Duration::from_secs(10);
 /// How a gate is set up, in short.
 pub(super) fn digest(settings: &Settings) -> String {
     let text = serde_json::to_vec(settings).unwrap_or_default();
-    let digest = ring::digest::digest(&ring::digest::SHA256, &text);
-    digest.as_ref().iter().take(12).map(|byte| format!("{byte:02x}")).collect()
+    companion::digest(&text)
 }
 
 /// A task that may connect.
@@ -225,62 +218,7 @@ impl Keeper {
 
     /// Keeps a gate until dropped; the gate stays.
     pub(crate) async fn run(self: Arc<Keeper>) {
-        let mut child: Option<Child> = None;
-        let mut served = false;
-        loop {
-            // A gate that has ended must not stay a zombie. One that ran is started again at once: the robot stands only when
-            // the next one has said so.
-            if let Some(gate) = &mut child
-                && matches!(gate.try_wait(), Ok(Some(_)))
-            {
-                if !std::mem::take(&mut served) {
-                    tokio::time::sleep(START_AGAIN).await;
-                }
-                child = None;
-            }
-            match UnixStream::connect(self.dir.join(AGENT_SOCKET)).await {
-                Ok(stream) => {
-                    served = true;
-                    let ended = self.talk(stream).await;
-                    self.standing.send_replace(Standing::default());
-                    let error = ended.err().map(|error| chain(&error));
-                    tracing::warn!(error, "the gate is gone: the robot stands");
-                }
-                Err(_) if child.is_none() => match self.start() {
-                    Ok(started) => child = Some(started),
-                    Err(error) => {
-                        tracing::error!(error = chain(&error), "the gate does not start");
-                        tokio::time::sleep(START_AGAIN).await;
-                    }
-                },
-                Err(_) => {}
-            }
-            tokio::time::sleep(AGAIN).await;
-        }
-    }
-
-    fn start(&self) -> Result<Child, FileError> {
-        let dir = &self.dir;
-        let tasks = self.tasks_dir();
-        // Passable, not listable: tasks of other users find their socket.
-        let made = fs::DirBuilder::new().recursive(true).mode(0o711).create(&tasks);
-        made.map_err(FileError::at("make", &tasks))?;
-        durable::write_json(&dir.join(settings::FILE), &self.settings, Keep::Crash)?;
-        let path = dir.join(LOG);
-        let log = File::options().create(true).append(true).open(&path);
-        let log = log.map_err(FileError::at("open", &path))?;
-        let mut command = Command::new(&self.program);
-        command.arg(VERB).arg(dir).stdin(Stdio::null()).stdout(Stdio::null()).stderr(log);
-        // SAFETY: setsid is async-signal-safe, and nothing else happens between fork and exec.
-        unsafe {
-            // What ends the agent's terminal or its group does not end the gate.
-            command.pre_exec(|| match libc::setsid() {
-                -1 => Err(std::io::Error::last_os_error()),
-                _ => Ok(()),
-            });
-        }
-        tracing::info!("starting the gate");
-        command.spawn().map_err(FileError::at("start a gate for", dir))
+        companion::keep(&*self).await;
     }
 
     async fn talk(&self, stream: UnixStream) -> std::io::Result<()> {
@@ -322,6 +260,37 @@ impl Keeper {
             ended = write => ended,
             ended = read => ended,
         }
+    }
+}
+
+impl Kept for Keeper {
+    const NAME: &str = "gate";
+    const START_AGAIN: Duration = Duration::from_millis(200);
+
+    fn socket(&self) -> PathBuf {
+        self.dir.join(AGENT_SOCKET)
+    }
+
+    fn start(&self) -> Result<Child, FileError> {
+        let dir = &self.dir;
+        let tasks = self.tasks_dir();
+        // Passable, not listable: tasks of other users find their socket.
+        let made = fs::DirBuilder::new().recursive(true).mode(0o711).create(&tasks);
+        made.map_err(FileError::at("make", &tasks))?;
+        durable::write_json(&dir.join(settings::FILE), &self.settings, Keep::Crash)?;
+        let path = dir.join(LOG);
+        let log = File::options().create(true).append(true).open(&path);
+        let log = log.map_err(FileError::at("open", &path))?;
+        companion::start(&self.program, VERB, dir, log)
+            .map_err(FileError::at("start a gate for", dir))
+    }
+
+    async fn attend(&self, stream: UnixStream) -> bool {
+        let ended = self.talk(stream).await;
+        self.standing.send_replace(Standing::default());
+        let error = ended.err().map(|error| chain(&error));
+        tracing::warn!(error, "the gate is gone: the robot stands");
+        true
     }
 }
 

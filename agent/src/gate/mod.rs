@@ -40,13 +40,10 @@ mod record;
 pub(crate) mod settings;
 
 use std::ffi::OsString;
-use std::fs::File;
 use std::io::Write as _;
-use std::os::fd::AsFd as _;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
-use rustix::fs::FlockOperation;
-
+use crate::companion;
 use crate::durable::{self, FileError};
 use settings::Settings;
 
@@ -71,8 +68,6 @@ pub(crate) const TOKEN_ENV: &str = "MUSTER_GATE_TOKEN";
 /// Why a gate does not run.
 #[derive(Debug, thiserror::Error)]
 enum GateError {
-    #[error("usage: {VERB} DIR")]
-    Usage,
     #[error("there are no settings in {0}")]
     NoSettings(PathBuf),
     #[error("another gate runs in {0}")]
@@ -89,52 +84,18 @@ enum GateError {
 
 /// Runs the gate with the arguments after the verb, and ends the process.
 pub fn main(args: impl IntoIterator<Item = OsString>) -> ! {
-    let code = match run(args) {
-        Ok(()) => 0,
-        Err(error) => {
-            // Its log; nobody else is listening.
-            let _ = writeln!(std::io::stderr(), "muster gate: {}", crate::driver::chain(&error));
-            1
-        }
-    };
-    std::process::exit(code)
+    companion::main(VERB, args, run)
 }
 
-fn run(args: impl IntoIterator<Item = OsString>) -> Result<(), GateError> {
-    let args: Vec<OsString> = args.into_iter().collect();
-    let [dir] = args.as_slice() else { return Err(GateError::Usage) };
-    let dir = PathBuf::from(dir);
-    let filter = tracing_subscriber::EnvFilter::try_from_default_env()
-        .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("info"));
-    tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).init();
-    let _lock = lock(&dir)?;
+fn run(dir: PathBuf) -> Result<(), GateError> {
+    let Some(mut lock) = companion::lock(&dir)? else { return Err(GateError::InUse(dir)) };
+    let pid = format!("{}\n", std::process::id());
+    let written = lock.set_len(0).and_then(|()| lock.write_all(pid.as_bytes()));
+    written.map_err(FileError::at("write the lock of", &dir))?;
     let path = dir.join(settings::FILE);
     let settings: Settings = durable::read_json(&path)?.ok_or(GateError::NoSettings(path))?;
-    let runtime = tokio::runtime::Builder::new_current_thread()
-        .enable_all()
-        // The record's and the log's.
-        .max_blocking_threads(2)
-        .build()
-        .map_err(|source| GateError::System { what: "start", source })?;
+    // The record's and the log's.
+    let runtime =
+        companion::runtime(2).map_err(|source| GateError::System { what: "start", source })?;
     runtime.block_on(hall::serve(dir, settings))
-}
-
-/// Only one gate may speak to the drivers.
-fn lock(dir: &Path) -> Result<File, GateError> {
-    let path = dir.join("lock");
-    let mut file = File::options()
-        .create(true)
-        .truncate(false)
-        .write(true)
-        .open(&path)
-        .map_err(FileError::at("open", &path))?;
-    match rustix::fs::flock(file.as_fd(), FlockOperation::NonBlockingLockExclusive) {
-        Ok(()) => {}
-        Err(rustix::io::Errno::WOULDBLOCK) => return Err(GateError::InUse(dir.to_owned())),
-        Err(errno) => return Err(FileError::at("lock", &path)(errno.into()).into()),
-    }
-    let pid = format!("{}\n", std::process::id());
-    let written = file.set_len(0).and_then(|()| file.write_all(pid.as_bytes()));
-    written.map_err(FileError::at("write", &path))?;
-    Ok(file)
 }

@@ -7,6 +7,7 @@ use std::time::Duration;
 use hyper_util::rt::TokioIo;
 use muster_api::wire::{HTTP2_FRAME, HTTP2_WINDOW};
 use rustls::ClientConfig;
+use tokio::time::Instant;
 use tonic::transport::{Channel, Endpoint};
 
 use super::{Address, tls};
@@ -26,10 +27,49 @@ pub(crate) mod service {
 
 /// First and longest pause between two tries. The first is short, because a controller that is
 /// started anew is back within seconds; the longest bounds how long a robot is alone for nothing.
-pub(super) const PAUSE: (Duration, Duration) = (Duration::from_millis(50), Duration::from_secs(5));
+const PAUSE: (Duration, Duration) = (Duration::from_millis(50), Duration::from_secs(5));
 
 /// A connection on which nothing was heard for this long is given up.
 pub(crate) const DEAF_AFTER: Duration = Duration::from_secs(10);
+
+/// Pauses between tries, each twice as long as the one before it.
+#[derive(Debug)]
+pub(super) struct Pauses(Duration);
+
+impl Default for Pauses {
+    fn default() -> Pauses {
+        Pauses(PAUSE.0)
+    }
+}
+
+impl Pauses {
+    /// No try has failed since the last one that lasted.
+    pub(super) fn is_first(&self) -> bool {
+        self.0 == PAUSE.0
+    }
+
+    /// Waits after a try that began then; the first pause again after one that lasted.
+    pub(super) async fn wait(&mut self, begun: Instant) {
+        if begun.elapsed() > PAUSE.1 {
+            self.0 = PAUSE.0;
+        }
+        tokio::time::sleep(self.0).await;
+        self.0 = (self.0 * 2).min(PAUSE.1);
+    }
+}
+
+/// Why a stream beside the session ended.
+#[derive(Debug, thiserror::Error)]
+pub(super) enum StreamError {
+    #[error(transparent)]
+    Connect(#[from] DialError),
+    #[error("the controller ended the stream")]
+    Status(#[from] Box<tonic::Status>),
+    #[error("the controller closed the stream")]
+    Closed,
+    #[error("the stream did not begin within {} s", DEAF_AFTER.as_secs())]
+    Deaf,
+}
 
 /// There is no connection.
 #[derive(Debug, thiserror::Error)]

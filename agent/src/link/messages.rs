@@ -15,7 +15,7 @@ use tokio::time::Instant;
 use tokio_stream::wrappers::ReceiverStream;
 
 use super::dial::service::agent_service_client::AgentServiceClient;
-use super::dial::{DEAF_AFTER, DialError, Dialer, PAUSE};
+use super::dial::{DEAF_AFTER, Dialer, Pauses, StreamError};
 use crate::driver::chain;
 use crate::executor::desk::Desks;
 use crate::executor::frame::FRAME_MAX;
@@ -25,19 +25,6 @@ const QUEUE: usize = 1;
 
 /// Longer than a session's: on a slow link what asks whether the other side is there waits behind a message.
 const GONE_AFTER: Duration = Duration::from_secs(40);
-
-/// Why the stream ended.
-#[derive(Debug, thiserror::Error)]
-enum MessagesError {
-    #[error(transparent)]
-    Connect(#[from] DialError),
-    #[error("the controller ended the stream")]
-    Status(#[from] Box<tonic::Status>),
-    #[error("the controller closed the stream")]
-    Closed,
-    #[error("the stream did not begin within {} s", DEAF_AFTER.as_secs())]
-    Deaf,
-}
 
 /// What one session's are carried with.
 #[derive(Debug)]
@@ -53,11 +40,11 @@ impl Messages<'_> {
     pub(super) async fn run(self) -> Infallible {
         let in_reach = self.desks.in_reach();
         let mut executors = self.desks.executors();
-        let mut pause = PAUSE.0;
+        let mut pauses = Pauses::default();
         loop {
             let there = executors.borrow_and_update().clone();
             if there.is_empty() {
-                self.told.send_if_modified(|told| told.replace(there.clone()) != Some(there));
+                self.tell(there);
                 // Closed: the agent goes down.
                 if executors.changed().await.is_err() {
                     pending::<()>().await;
@@ -74,38 +61,38 @@ impl Messages<'_> {
             });
             let begun = Instant::now();
             match self.carry(&mut executors).await {
-                Ok(()) => pause = PAUSE.0,
+                Ok(()) => pauses = Pauses::default(),
                 Err(error) => {
                     in_reach.broke();
-                    if begun.elapsed() > PAUSE.1 {
-                        pause = PAUSE.0;
-                    }
                     tracing::warn!(error = chain(&error), "messages of executors are not carried");
-                    tokio::time::sleep(pause).await;
-                    pause = (pause * 2).min(PAUSE.1);
+                    pauses.wait(begun).await;
                 }
             }
         }
+    }
+
+    /// These are in reach.
+    fn tell(&self, there: BTreeSet<TaskUid>) {
+        self.told.send_if_modified(|told| told.replace(there.clone()) != Some(there));
     }
 
     /// Until there are no executors.
     async fn carry(
         &self,
         executors: &mut watch::Receiver<BTreeSet<TaskUid>>,
-    ) -> Result<(), MessagesError> {
+    ) -> Result<(), StreamError> {
         let (channel, _) = self.dialer.channel_with(GONE_AFTER).await?;
         let mut client = AgentServiceClient::new(channel)
             .max_decoding_message_size(FRAME_MAX)
             .max_encoding_message_size(FRAME_MAX);
         let (out, queue) = mpsc::channel::<proto::Message>(QUEUE);
         let begun = tokio::time::timeout(DEAF_AFTER, client.messages(ReceiverStream::new(queue)));
-        let mut heard =
-            begun.await.map_err(|_| MessagesError::Deaf)?.map_err(Box::new)?.into_inner();
+        let mut heard = begun.await.map_err(|_| StreamError::Deaf)?.map_err(Box::new)?.into_inner();
         let said = async {
             loop {
                 let message = self.desks.said().await;
                 if out.send(message).await.is_err() {
-                    return MessagesError::Closed;
+                    return StreamError::Closed;
                 }
             }
         };
@@ -116,7 +103,7 @@ impl Messages<'_> {
             tokio::select! {
                 message = heard.message() => match message.map_err(Box::new)? {
                     Some(message) => self.desks.hear(message),
-                    None => return Err(MessagesError::Closed),
+                    None => return Err(StreamError::Closed),
                 },
                 changed = executors.changed() => {
                     let there = executors.borrow_and_update().clone();
@@ -124,7 +111,7 @@ impl Messages<'_> {
                         executors.mark_changed();
                         return Ok(());
                     }
-                    self.told.send_if_modified(|told| told.replace(there.clone()) != Some(there));
+                    self.tell(there);
                 }
                 ended = &mut said => return Err(ended),
             }

@@ -10,28 +10,12 @@ use tokio::sync::watch;
 use tokio::time::Instant;
 
 use super::dial::service::agent_service_client::AgentServiceClient;
-use super::dial::{DialError, Dialer, PAUSE};
+use super::dial::{DEAF_AFTER, Dialer, Pauses, StreamError};
 use crate::driver::chain;
 use crate::gate::keeper::Keeper;
 
-/// It begins within this, once there is a connection.
-const BEGINS_WITHIN: Duration = Duration::from_secs(10);
-
 /// Shorter than a session's: a connection that is gone without a word keeps a stop from the robot for so long.
-const DEAF_AFTER: Duration = Duration::from_secs(2);
-
-/// Why the stream ended.
-#[derive(Debug, thiserror::Error)]
-enum OrdersError {
-    #[error(transparent)]
-    Connect(#[from] DialError),
-    #[error("the controller ended the stream")]
-    Status(#[from] Box<tonic::Status>),
-    #[error("the controller closed the stream")]
-    Closed,
-    #[error("nothing was heard for {} s", BEGINS_WITHIN.as_secs())]
-    Deaf,
-}
+const GONE_AFTER: Duration = Duration::from_secs(2);
 
 /// What is needed to hear them.
 #[derive(Debug)]
@@ -45,33 +29,29 @@ pub(crate) struct Orders {
 impl Orders {
     /// Hears them until it is dropped.
     pub(crate) async fn run(self) {
-        let mut pause = PAUSE.0;
+        let mut pauses = Pauses::default();
         loop {
             let begun = Instant::now();
             let Err(error) = self.follow().await;
             let was_heard = self.heard.send_replace(false);
             // One line a loss, not one a try.
-            if was_heard || pause == PAUSE.0 {
+            if was_heard || pauses.is_first() {
                 tracing::warn!(error = chain(&error), "emergency stops are not heard");
             }
-            if begun.elapsed() > PAUSE.1 {
-                pause = PAUSE.0;
-            }
-            tokio::time::sleep(pause).await;
-            pause = (pause * 2).min(PAUSE.1);
+            pauses.wait(begun).await;
         }
     }
 
-    async fn follow(&self) -> Result<Infallible, OrdersError> {
-        let (channel, _) = self.dialer.channel_with(DEAF_AFTER).await?;
+    async fn follow(&self) -> Result<Infallible, StreamError> {
+        let (channel, _) = self.dialer.channel_with(GONE_AFTER).await?;
         let mut client = AgentServiceClient::new(channel);
-        let begun = tokio::time::timeout(BEGINS_WITHIN, client.orders(proto::OrdersRequest {}));
-        let begun = begun.await.map_err(|_| OrdersError::Deaf)?.map_err(Box::new)?;
+        let begun = tokio::time::timeout(DEAF_AFTER, client.orders(proto::OrdersRequest {}));
+        let begun = begun.await.map_err(|_| StreamError::Deaf)?.map_err(Box::new)?;
         let mut orders = begun.into_inner();
         while let Some(order) = orders.message().await.map_err(Box::new)? {
             self.gate.demand(order.estop_tier, order.estop_release);
             self.heard.send_replace(true);
         }
-        Err(OrdersError::Closed)
+        Err(StreamError::Closed)
     }
 }

@@ -27,7 +27,7 @@ use tokio::time::{Instant, MissedTickBehavior};
 use tokio_stream::wrappers::ReceiverStream;
 
 use super::dial::service::agent_service_client::AgentServiceClient;
-use super::dial::{DEAF_AFTER, DialError, Dialer, PAUSE};
+use super::dial::{DEAF_AFTER, DialError, Dialer, Pauses};
 use super::messages::Messages;
 use super::report;
 use super::stream_logs::stream_logs;
@@ -91,20 +91,16 @@ pub(crate) fn outgoing(body: Say) -> proto::AgentMessage {
 impl Link {
     /// Keeps a session until it is dropped.
     pub(crate) async fn run(self, mut node: Node, mut door: Door) {
-        let mut pause = PAUSE.0;
+        let mut pauses = Pauses::default();
         loop {
             let begun = Instant::now();
             if let Err(error) = self.session(&mut node, &mut door).await {
                 // One line a loss, not one a try.
-                if begun.elapsed() > DEAF_AFTER || pause == PAUSE.0 {
+                if begun.elapsed() > DEAF_AFTER || pauses.is_first() {
                     tracing::warn!(error = chain(&error), "not connected to the controller");
                 }
             }
-            if begun.elapsed() > PAUSE.1 {
-                pause = PAUSE.0;
-            }
-            tokio::time::sleep(pause).await;
-            pause = (pause * 2).min(PAUSE.1);
+            pauses.wait(begun).await;
         }
     }
 

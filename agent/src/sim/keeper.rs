@@ -3,9 +3,8 @@
 
 use std::fs::{self, File};
 use std::os::unix::fs::DirBuilderExt as _;
-use std::os::unix::process::CommandExt as _;
 use std::path::PathBuf;
-use std::process::{Child, Command, Stdio};
+use std::process::Child;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -16,16 +15,10 @@ use tokio::sync::watch;
 
 use super::robot::Said;
 use super::settings::Settings;
-use super::{LOG, STATE, VERB, WORLD, digest};
-use crate::driver::chain;
+use super::{LOG, STATE, VERB, WORLD};
+use crate::companion::{self, Kept};
 use crate::durable::{self, FileError, Keep};
 use crate::runtime::process::Reexec;
-
-/// Between two looks for a simulator that is not there.
-const AGAIN: Duration = Duration::from_millis(20);
-
-/// Between two starts of one that ends before it has said anything.
-const START_AGAIN: Duration = Duration::from_secs(1);
 
 /// A simulator that has not said anything for this long is stuck: it speaks every second.
 const STUCK: Duration = Duration::from_secs(5);
@@ -44,7 +37,7 @@ impl Simulator {
     /// A keeper of the simulator in `dir`; nothing is started yet.
     pub(crate) fn new(settings: &Settings, dir: PathBuf, reexec: &Reexec) -> Simulator {
         let world = serde_json::to_vec(settings).unwrap_or_default();
-        let digest = digest(&world);
+        let digest = companion::digest(&world);
         Simulator {
             world,
             digest,
@@ -61,58 +54,7 @@ impl Simulator {
 
     /// Keeps a simulator until dropped; the simulator stays.
     pub(crate) async fn run(self: Arc<Simulator>) {
-        let mut child: Option<Child> = None;
-        let mut served = false;
-        loop {
-            // One that has ended must not stay a zombie.
-            if let Some(simulator) = &mut child
-                && matches!(simulator.try_wait(), Ok(Some(_)))
-            {
-                if !std::mem::take(&mut served) {
-                    tracing::error!(log = %self.dir.join(LOG).display(), "the simulator ended");
-                    tokio::time::sleep(START_AGAIN).await;
-                }
-                child = None;
-            }
-            match UnixStream::connect(self.dir.join(STATE)).await {
-                Ok(stream) => {
-                    served |= self.listen(stream).await;
-                    self.said.send_replace(None);
-                    tracing::warn!("the simulator is gone");
-                }
-                Err(_) if child.is_none() => match self.start() {
-                    Ok(started) => child = Some(started),
-                    Err(error) => {
-                        tracing::error!(error = chain(&error), "the simulator does not start");
-                        tokio::time::sleep(START_AGAIN).await;
-                    }
-                },
-                Err(_) => {}
-            }
-            tokio::time::sleep(AGAIN).await;
-        }
-    }
-
-    fn start(&self) -> Result<Child, FileError> {
-        let dir = &self.dir;
-        // Nobody but the agent and the gate comes to the robot.
-        let made = fs::DirBuilder::new().recursive(true).mode(0o700).create(dir);
-        made.map_err(FileError::at("make", dir))?;
-        durable::write(&dir.join(WORLD), &self.world, 0o600, Keep::Crash)?;
-        let path = dir.join(LOG);
-        let log = File::create(&path).map_err(FileError::at("open", &path))?;
-        let mut command = Command::new(&self.program);
-        command.arg(VERB).arg(dir).stdin(Stdio::null()).stdout(Stdio::null()).stderr(log);
-        // SAFETY: setsid is async-signal-safe, and nothing else happens between fork and exec.
-        unsafe {
-            // What ends the agent's terminal or its group does not end the robot.
-            command.pre_exec(|| match libc::setsid() {
-                -1 => Err(std::io::Error::last_os_error()),
-                _ => Ok(()),
-            });
-        }
-        tracing::info!("starting the simulator");
-        command.spawn().map_err(FileError::at("start a simulator for", dir))
+        companion::keep(&*self).await;
     }
 
     /// Hears it until it is gone; whether it has said anything.
@@ -150,5 +92,37 @@ impl Simulator {
             }
             heard = true;
         }
+    }
+}
+
+impl Kept for Simulator {
+    const NAME: &str = "simulator";
+    const START_AGAIN: Duration = Duration::from_secs(1);
+
+    fn socket(&self) -> PathBuf {
+        self.dir.join(STATE)
+    }
+
+    fn start(&self) -> Result<Child, FileError> {
+        let dir = &self.dir;
+        // Nobody but the agent and the gate comes to the robot.
+        let made = fs::DirBuilder::new().recursive(true).mode(0o700).create(dir);
+        made.map_err(FileError::at("make", dir))?;
+        durable::write(&dir.join(WORLD), &self.world, 0o600, Keep::Crash)?;
+        let path = dir.join(LOG);
+        let log = File::create(&path).map_err(FileError::at("open", &path))?;
+        companion::start(&self.program, VERB, dir, log)
+            .map_err(FileError::at("start a simulator for", dir))
+    }
+
+    async fn attend(&self, stream: UnixStream) -> bool {
+        let heard = self.listen(stream).await;
+        self.said.send_replace(None);
+        tracing::warn!("the simulator is gone");
+        heard
+    }
+
+    fn has_failed(&self) {
+        tracing::error!(log = %self.dir.join(LOG).display(), "the simulator ended");
     }
 }

@@ -36,13 +36,9 @@ mod serve;
 pub(crate) mod settings;
 
 use std::ffi::OsString;
-use std::fs::File;
-use std::io::Write as _;
-use std::os::fd::AsFd as _;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
-use rustix::fs::FlockOperation;
-
+use crate::companion;
 use crate::durable::{self, FileError};
 use settings::Settings;
 
@@ -67,8 +63,6 @@ pub(crate) const STOP: &str = r#"{"linear": 0, "angular": 0}"#;
 /// Why a simulator does not run.
 #[derive(Debug, thiserror::Error)]
 enum SimError {
-    #[error("usage: {VERB} DIR")]
-    Usage,
     #[error("there is no world in {0}")]
     NoWorld(PathBuf),
     #[error("another simulator runs in {0}")]
@@ -87,50 +81,15 @@ enum SimError {
 
 /// Runs the simulator with the arguments after the verb, and ends the process.
 pub fn main(args: impl IntoIterator<Item = OsString>) -> ! {
-    let code = match run(args) {
-        Ok(()) => 0,
-        Err(error) => {
-            // Its log; nobody else is listening.
-            let _ = writeln!(std::io::stderr(), "muster {VERB}: {}", crate::driver::chain(&error));
-            1
-        }
-    };
-    std::process::exit(code)
+    companion::main(VERB, args, run)
 }
 
-fn run(args: impl IntoIterator<Item = OsString>) -> Result<(), SimError> {
-    let args: Vec<OsString> = args.into_iter().collect();
-    let [dir] = args.as_slice() else { return Err(SimError::Usage) };
-    let dir = PathBuf::from(dir);
-    let filter = tracing_subscriber::EnvFilter::try_from_default_env()
-        .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("info"));
-    tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).init();
-    let _lock = lock(&dir)?;
+fn run(dir: PathBuf) -> Result<(), SimError> {
+    let Some(_lock) = companion::lock(&dir)? else { return Err(SimError::InUse(dir)) };
     let path = dir.join(WORLD);
     let settings: Settings = durable::read_json(&path)?.ok_or(SimError::NoWorld(path))?;
-    let runtime = tokio::runtime::Builder::new_current_thread()
-        .enable_all()
-        // The record's.
-        .max_blocking_threads(1)
-        .build()
-        .map_err(|source| SimError::System { what: "start", source })?;
+    // The record's.
+    let runtime =
+        companion::runtime(1).map_err(|source| SimError::System { what: "start", source })?;
     runtime.block_on(serve::serve(&dir, &settings))
-}
-
-/// There is one robot.
-fn lock(dir: &Path) -> Result<File, SimError> {
-    let path = dir.join("lock");
-    let file = File::options().create(true).truncate(false).write(true).open(&path);
-    let file = file.map_err(FileError::at("open", &path))?;
-    match rustix::fs::flock(file.as_fd(), FlockOperation::NonBlockingLockExclusive) {
-        Ok(()) => Ok(file),
-        Err(rustix::io::Errno::WOULDBLOCK) => Err(SimError::InUse(dir.to_owned())),
-        Err(errno) => Err(FileError::at("lock", &path)(errno.into()).into()),
-    }
-}
-
-/// A world, in short.
-fn digest(world: &[u8]) -> String {
-    let digest = ring::digest::digest(&ring::digest::SHA256, world);
-    digest.as_ref().iter().take(12).map(|byte| format!("{byte:02x}")).collect()
 }

@@ -14,8 +14,9 @@ use prost::Message as _;
 use serde::{Deserialize, Serialize};
 
 use super::settings::Settings;
-use super::{SimError, WORLD, digest};
+use super::{SimError, WORLD};
 use crate::clock;
+use crate::companion;
 use crate::durable::{self, FileError, Keep};
 
 /// Where the robot was.
@@ -73,7 +74,8 @@ impl Robot {
     /// The robot of `dir`, where it was left.
     pub(super) fn open(dir: &Path, settings: &Settings) -> Result<Robot, SimError> {
         let path = dir.join(WORLD);
-        let digest = digest(&std::fs::read(&path).map_err(FileError::at("read", &path))?);
+        let digest =
+            companion::digest(&std::fs::read(&path).map_err(FileError::at("read", &path))?);
         let (world, kept, now) = (settings.world(), dir.join(KEPT), clock::boot());
         let left: Option<Kept> = durable::read_json(&kept)?;
         let left = left.filter(|left| left.world == digest);
