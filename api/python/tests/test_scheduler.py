@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import gc
 import threading
+import weakref
 
 import grpc
 import pytest
@@ -10,6 +12,7 @@ import pytest
 import muster
 from fake_controller import PATIENCE
 from muster._pb import framework as pb
+from muster._stream import Stream
 from recorder import Heard, Recorder
 
 
@@ -432,6 +435,43 @@ def test_a_teardown_outlives_a_broken_session(controller, start):
     again.expect_end()
     again.end()
     assert driver.join(PATIENCE) is muster.DriverState.STOPPED
+
+
+@pytest.fixture
+def calls(monkeypatch):
+    """Weak references to gRPC's calls. With one alive at its end, Python may hang."""
+    made = []
+    begin = Stream.__init__
+
+    def watched(stream, *arguments):
+        begin(stream, *arguments)
+        made.append(weakref.ref(stream._call))
+
+    monkeypatch.setattr(Stream, "__init__", watched)
+    gc.disable()
+    yield made
+    gc.enable()
+
+
+@pytest.mark.parametrize("last", [None, (grpc.StatusCode.UNAVAILABLE, "down"), (grpc.StatusCode.UNAUTHENTICATED, "who?")])
+def test_no_call_of_grpc_outlives_its_driver(controller, start, calls, last):
+    driver, scheduler, session = registered(controller, start)
+    session.end((grpc.StatusCode.UNAVAILABLE, "broken"))
+    session = controller.accept()
+    session.subscribed(reregistered=True)
+    scheduler.heard.expect("disconnected")
+    scheduler.heard.expect("reregistered")
+    if last is None:
+        driver.stop()
+        session.expect("teardown")
+        session.answer()
+        session.expect_end()
+    session.end(last)
+    if last is not None and last[0] is grpc.StatusCode.UNAVAILABLE:
+        controller.accept()
+        driver.abort()
+    driver.join(PATIENCE)
+    assert len(calls) in (2, 3) and [call() for call in calls] == [None] * len(calls)
 
 
 def test_an_error_is_the_last_thing_told(controller, start):

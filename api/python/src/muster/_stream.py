@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Iterator
-from typing import Callable, Optional
+from typing import Any, Callable, Optional
 
 import grpc
 
@@ -95,16 +95,20 @@ class Stream:
         session = self._channel.stream_stream(
             _METHOD, request_serializer=pb.Call.SerializeToString, response_deserializer=pb.Event.FromString
         )
-        self._call = session(calls)
+        self._call: Optional[Any] = session(calls)
         self.watch = Watch(connect_seconds, self.cancel)
 
     def __iter__(self) -> Iterator[pb.Event]:
         try:
-            for event in self._call:
+            for event in self._call or ():
                 self.watch.feed()
                 yield event
+            return
         except grpc.RpcError as error:
-            raise self._translated(error) from None
+            ended = self._translated(error)
+            # It is the call itself, which its own traceback would keep alive: see `close`.
+            error.__traceback__ = None
+        raise ended
 
     def _translated(self, error: grpc.RpcError) -> Exception:
         if self._why is not None:
@@ -118,9 +122,14 @@ class Stream:
     def cancel(self, why: str) -> None:
         """From any thread."""
         self._why = why
-        self._call.cancel()
+        call = self._call
+        if call is not None:
+            call.cancel()
 
     def close(self) -> None:
         self.watch.close()
-        self._call.cancel()
+        self.cancel(self._why or "closed")
+        # Nobody may have the call when Python ends: it takes a lock when it is collected, and gRPC's threads, which have that
+        # lock at times, are dead by then. The program would hang.
+        self._call = None
         self._channel.close()
