@@ -156,12 +156,12 @@ impl Board {
 
     /// Usage of the running tasks since the last call.
     pub(crate) fn sample(&self) -> Vec<Usage> {
-        let now = Instant::now();
         let mut entries = self.entries();
         let mut usage = Vec::new();
         for (uid, entry) in entries.iter_mut() {
             let id = AttemptId { uid: uid.clone(), attempt: entry.attempt };
             let Some(used) = entry.runtime.used(&id) else { continue };
+            let now = Instant::now();
             let before = entry.sample.replace((now, used));
             let cpu_millis = before.map_or(0, |(at, before)| {
                 let micros = now.duration_since(at).as_micros().max(1);

@@ -51,6 +51,8 @@ mod footprint;
 pub mod gate;
 mod gauge;
 mod given;
+#[cfg(test)]
+mod hostile;
 mod images;
 mod link;
 mod mission;

@@ -61,6 +61,8 @@ fn only_the_holder_drives_and_is_told_who_it_is() {
     let mut b = Holder::register(&agent, "b");
     assert_eq!((a.task.as_str(), b.task.as_str()), ("a", "b"));
     assert_eq!(a.verdict("6", "go 1"), Verdict::Ok);
+    // Of commands that wait for the driver only the newest is kept.
+    driver.wait("go 1");
     let refused = b.command("6", "go wrong").unwrap();
     assert_eq!(refused.verdict(), Verdict::NotHolder);
     let holder = refused.holder.unwrap();
@@ -70,6 +72,7 @@ fn only_the_holder_drives_and_is_told_who_it_is() {
     // Delegation, and taking back.
     assert_eq!(a.delegate("6,1", "b"), Verdict::Ok);
     assert_eq!(b.verdict("6,1", "go 2"), Verdict::Ok);
+    driver.wait("go 2");
     assert_eq!(a.verdict("6,0", "go wrong"), Verdict::Older);
     assert_eq!(a.verdict("6,2", "go 3"), Verdict::Ok);
     assert_eq!(b.verdict("6,1", "go wrong"), Verdict::Older);

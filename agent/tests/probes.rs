@@ -329,7 +329,7 @@ fn the_agent_is_killed_and_its_probes_go_on_without_a_flap() {
     spec["startup"] = exec("[ ! -e $MUSTER_RUN_DIR/once ] && touch $MUSTER_RUN_DIR/once");
     // While `stuck` is there, a check does not come back.
     spec["readiness"] = exec(
-        "cd $MUSTER_RUN_DIR; echo $$ > check; while [ -e stuck ]; do sleep 0.02; done; [ ! -e bad ]",
+        "cd $MUSTER_RUN_DIR; while [ -e stuck ]; do echo $$ > held; sleep 0.02; done; [ ! -e bad ]",
     );
     spec["readiness"]["timeout"] = json!("1h");
     controller.assign("kept", spec);
@@ -337,10 +337,11 @@ fn the_agent_is_killed_and_its_probes_go_on_without_a_flap() {
     let run = agent.task_dir("kept").join("run");
     let before = agent.main_pid("kept", 1);
     std::fs::write(run.join("stuck"), "").unwrap();
-    let seen = pid_in(&run.join("check"));
-    let check = until("a check under way", || {
-        Some(pid_in(&run.join("check"))).filter(|pid| *pid != seen && lives(*pid))
-    });
+    let held = || {
+        let pid: i32 = std::fs::read_to_string(run.join("held")).ok()?.trim().parse().ok()?;
+        Some(pid).filter(|pid| lives(*pid))
+    };
+    let check = until("a check under way", held);
     agent.kill();
     until("the end of the check with its agent", || (!lives(check)).then_some(()));
     let told = controller.reports("kept").len();
@@ -348,14 +349,7 @@ fn the_agent_is_killed_and_its_probes_go_on_without_a_flap() {
     let hello = controller.wait_hello(2);
     assert_eq!(hello.tasks.iter().map(|t| t.ready).collect::<Vec<_>>(), [Some(true)]);
     // The checks go on, and start-up, which would fail now, is not asked again.
-    until("a check of the new life", || {
-        std::fs::read_to_string(run.join("check"))
-            .ok()?
-            .trim()
-            .parse()
-            .ok()
-            .filter(|p: &i32| lives(*p))
-    });
+    until("a check of the new life", held);
     std::fs::write(run.join("bad"), "").unwrap();
     std::fs::remove_file(run.join("stuck")).unwrap();
     let bad = wait_ready(&controller, "kept", false);

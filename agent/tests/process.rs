@@ -375,8 +375,8 @@ fn the_groups_of_a_dead_agent_go_and_come_back_with_it() {
     controller.assign("one", sh("exit 0"));
     controller.wait_end("one");
     let root = dead.group("one", 1, "cpu").parent().unwrap().to_owned();
-    dead.kill();
     assert!(root.is_dir());
+    dead.kill();
     // Another agent's start takes them away, of this machine but of another directory.
     let other = Controller::start();
     let mut living = Agent::start(&other);

@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::fs::{self, File};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
+use std::time::Instant;
 
 use http::Request;
 use kube::config::{KubeConfigOptions, Kubeconfig};
@@ -155,6 +156,22 @@ impl Cluster {
 
     /// Starts the controller (again, on the same port and data); returns when it is ready.
     pub async fn start_controller(&mut self) {
+        let begun = Instant::now();
+        let url = loop {
+            self.spawn_controller();
+            if let Some(url) = self.controller_ready().await {
+                break url;
+            }
+            self.await_controller();
+            // While it was away its port may have been given to whoever asked for any. No other end is passed over.
+            let log = self.log_of("controller");
+            let taken = log.lines().last().is_some_and(|line| line.contains("already in use"));
+            assert!(taken && begun.elapsed() < wait::DEADLINE, "it does not start: {log}");
+        };
+        url.trim_start_matches("https://").clone_into(&mut self.listen);
+    }
+
+    fn spawn_controller(&mut self) {
         assert!(self.controller.is_none(), "the controller runs");
         let child = Command::new(binary("muster-controller"))
             .args(["--listen", &self.listen, "--data-dir"])
@@ -167,17 +184,24 @@ impl Cluster {
             .spawn()
             .expect("the controller starts");
         self.controller = Some(child);
-        let url = wait::until("ready", || async {
+    }
+
+    /// Waits until the controller is ready, and gives its address; `None`: it has ended.
+    async fn controller_ready(&self) -> Option<String> {
+        let pid = self.controller_pid();
+        wait::until("ready", || async {
+            if kernel::start_time(pid).is_none() {
+                return Ok(None);
+            }
             let client = self.try_client().await?;
             let request = Request::get("/readyz").body(Vec::new()).expect("a request");
             client
                 .request_text(request)
                 .await
                 .map_err(|e| format!("{e}: {}", self.log_of("controller")))?;
-            Ok(self.server_url())
+            Ok(Some(self.server_url()))
         })
-        .await;
-        url.trim_start_matches("https://").clone_into(&mut self.listen);
+        .await
     }
 
     fn server_url(&self) -> String {

@@ -14,7 +14,7 @@ pub struct Process {
     pub start: u64,
 }
 
-/// Every process whose environment holds `NAME=value`. Tasks are found by `MUSTER_UID`.
+/// Every process whose environment holds `NAME=value`, the oldest first. Tasks are found by `MUSTER_UID`.
 #[must_use]
 pub fn with_env(name: &str, value: &str) -> Vec<Process> {
     let wanted = format!("{name}={value}");
@@ -31,7 +31,8 @@ pub fn with_env(name: &str, value: &str) -> Vec<Process> {
             found.push(Process { pid, start });
         }
     }
-    found.sort();
+    // Numbers wrap: an older process may have the larger one.
+    found.sort_by_key(|process| (process.start, process.pid));
     found
 }
 

@@ -207,11 +207,14 @@ mod tests {
         assert!(first.command(b"{\"linear\": 0.3, \"angel\": 1}").is_err());
         first.command(b"{\"linear\": 0.5, \"angular\": 0.1}").unwrap();
         std::thread::sleep(std::time::Duration::from_millis(60));
+        // It drives on meanwhile, however long that takes; and what is kept goes through text.
+        let before = first.say();
         first.keep().unwrap();
-        let left = first.say();
-        assert!(left.x > 0.0, "{left:?}");
+        let after = first.say();
+        assert!(before.x > 0.0, "{before:?}");
         let second = world("battery: {charge: 50}").say();
-        assert!((second.x - left.x).abs() < 0.05 && second.x > 0.0, "{second:?}");
+        let left = before.x - 1e-9..=after.x + 1e-9;
+        assert!(left.contains(&second.x), "{before:?} {second:?} {after:?}");
         assert_eq!(world("battery: {charge: 60}").say().x, 0.0);
     }
 

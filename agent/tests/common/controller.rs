@@ -151,7 +151,6 @@ impl Controller {
         self.seen(|seen| seen.mute = mute);
     }
 
-    /// Ends the session, and refuses others until told otherwise.
     /// Whether what agents say is left where it is.
     pub fn set_stuck(&self, stuck: bool) {
         self.seen(|seen| seen.stuck.send_replace(stuck));
@@ -161,6 +160,7 @@ impl Controller {
         self.seen(|seen| seen.stuck_messages.send_replace(stuck));
     }
 
+    /// Ends the session, and refuses others until told otherwise.
     pub fn set_away(&self, away: bool) {
         self.seen(|seen| {
             seen.away = away;

@@ -86,6 +86,8 @@ pub struct Cluster {
     left: BTreeMap<Slot, BTreeSet<Arc<str>>>,
     /// Grows with everything that may give a waiting task another answer, but for live poses.
     edition: u64,
+    /// How often room that was kept for a task was given up.
+    given_up: u64,
     models: Models,
 }
 
@@ -251,10 +253,17 @@ impl Cluster {
     /// No room is kept for the task any more.
     pub fn unnominate(&mut self, uid: &TaskUid) {
         let Some(slot) = self.nominated.remove(uid) else { return };
+        self.given_up += 1;
         if self.members[slot as usize].ledger.unkeep(uid) {
             self.freed.insert(slot);
             self.touch(slot);
         }
+    }
+
+    /// Grows whenever room that was kept for a task is given up: others may have it.
+    #[must_use]
+    pub(crate) fn given_up(&self) -> u64 {
+        self.given_up
     }
 
     /// The node on which room is kept for a task.
@@ -450,6 +459,7 @@ impl Cluster {
 
     /// Sets or removes what a Site says of its floor.
     pub fn set_site(&mut self, name: &str, site: Option<&SiteSpec>) {
+        self.edition += 1;
         self.sites.set(name, site);
     }
 

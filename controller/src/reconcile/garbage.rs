@@ -13,15 +13,26 @@ use std::time::Duration;
 use serde::Deserialize;
 use serde_json::Value;
 
-use super::{again, next_events, watch_from_now};
+use super::{RETRY, next_events, watch_from_now};
 use crate::context::Context;
-use crate::rest::delete::{delete_object, waits_for_others};
-use crate::store::{Change, Key, StoreError, Stored, UpdateError};
+use crate::objects;
+use crate::rest::delete::{delete_object, is_left_over, waits_for_others};
+use crate::rest::replacement;
+use crate::store::{Change, Key, StoreError, Stored};
 
 const FOREGROUND: &str = "foregroundDeletion";
 const ORPHAN: &str = "orphan";
 /// Between two rounds while deletions wait: one round for the writes of so long, and not one for each.
 const PAUSE: Duration = Duration::from_millis(100);
+
+/// Why it begins anew, with a look at everything.
+#[derive(Debug, thiserror::Error)]
+enum Failed {
+    #[error(transparent)]
+    Store(#[from] StoreError),
+    #[error("an object is not deleted: {0}")]
+    End(String),
+}
 
 #[derive(Debug, Default)]
 struct Graph {
@@ -61,7 +72,7 @@ impl Graph {
             }
         }
         let waits = || stored.mentions(FOREGROUND) || stored.mentions(ORPHAN);
-        if stored.mentions("deletionTimestamp") && waits() {
+        if stored.mentions("deletionTimestamp") && (waits() || is_left_over(stored)) {
             self.waiting.insert(stored.key.clone(), stored.uid.clone());
         }
     }
@@ -105,10 +116,15 @@ fn owner_uids(stored: &Stored) -> BTreeSet<String> {
 
 /// Works until dropped.
 pub async fn run(context: Arc<Context>) {
-    again(&context, "garbage is not collected yet", follow).await;
+    loop {
+        if let Err(error) = follow(&context).await {
+            tracing::warn!(error = crate::app::chain(&error), "garbage is not collected yet");
+            tokio::time::sleep(RETRY).await;
+        }
+    }
 }
 
-async fn follow(context: &Context) -> Result<(), StoreError> {
+async fn follow(context: &Context) -> Result<(), Failed> {
     let mut watcher = watch_from_now(&context.store).await;
     let mut graph = Graph::default();
     for stored in context.store.list_all() {
@@ -119,8 +135,7 @@ async fn follow(context: &Context) -> Result<(), StoreError> {
         for key in std::mem::take(&mut look) {
             if graph.lost(&key) && graph.is_present(context, &key) {
                 tracing::info!(%key, "its owner is gone, deleting it");
-                // A refusal (it went already, it may not go) leaves nothing to do here.
-                drop(delete_object(context, &key).await);
+                end(context, &key).await?;
             }
         }
         for (key, uid) in graph.waiting.clone() {
@@ -146,7 +161,7 @@ async fn follow(context: &Context) -> Result<(), StoreError> {
 }
 
 /// Does what a waiting deletion waits for, and takes the finalizer off when that is done.
-async fn finish(context: &Context, graph: &Graph, key: &Key, uid: &str) -> Result<(), StoreError> {
+async fn finish(context: &Context, graph: &Graph, key: &Key, uid: &str) -> Result<(), Failed> {
     let Some(stored) = context.store.get(key) else { return Ok(()) };
     let object = stored.value();
     let has = |name: &str| {
@@ -163,14 +178,14 @@ async fn finish(context: &Context, graph: &Graph, key: &Key, uid: &str) -> Resul
         return update(context, key, |object| remove_finalizer(object, ORPHAN)).await;
     }
     if !has(FOREGROUND) {
-        return Ok(());
+        return if is_left_over(&stored) { end(context, key).await } else { Ok(()) };
     }
     let mut left = 0;
     for dependent in dependents {
         let Some(stored) = context.store.get(dependent) else { continue };
         left += 1;
         if !waits_for_others(&stored) {
-            drop(delete_object(context, dependent).await);
+            end(context, dependent).await?;
         }
     }
     if left == 0 {
@@ -180,32 +195,33 @@ async fn finish(context: &Context, graph: &Graph, key: &Key, uid: &str) -> Resul
     }
 }
 
+/// Ends an object. A refusal (it went already, it may not go) leaves nothing to do here.
+async fn end(context: &Context, key: &Key) -> Result<(), Failed> {
+    match delete_object(context, key).await {
+        Err(failure) if failure.code() >= 500 => Err(Failed::End(failure.message().to_owned())),
+        Ok(_) | Err(_) => Ok(()),
+    }
+}
+
+/// Changes an object, in one transaction with its end when that was the last thing that it waited for.
 async fn update(
     context: &Context,
     key: &Key,
     change: impl Fn(&mut Value) -> bool + Send + Sync,
-) -> Result<(), StoreError> {
-    let written = context
-        .store
-        .update(key, |_, mut object| {
-            Ok::<_, std::convert::Infallible>(change(&mut object).then_some(object))
-        })
-        .await;
-    match written {
-        Ok(_) | Err(UpdateError::Store(StoreError::NotFound { .. })) => {}
-        Err(UpdateError::Store(error)) => return Err(error),
-        Err(UpdateError::Refused(never)) => match never {},
+) -> Result<(), Failed> {
+    loop {
+        let Some(present) = context.store.get(key) else { return Ok(()) };
+        let mut object = present.value();
+        if !change(&mut object) {
+            return Ok(());
+        }
+        let Some(op) = replacement(&present, &object) else { return Ok(()) };
+        match context.store.apply_one(op).await {
+            Ok(_) => return Ok(()),
+            Err(error) if objects::is_race(&error) => tokio::task::yield_now().await,
+            Err(error) => return Err(error.into()),
+        }
     }
-    // With its last finalizer gone, a marked object goes; for a Task the deletion loop sees to it.
-    let last = context.store.get(key).map(|s| s.value());
-    let free = last.as_ref().is_some_and(|o| {
-        o.pointer("/metadata/deletionTimestamp").is_some()
-            && o.pointer("/metadata/finalizers").and_then(Value::as_array).is_none_or(Vec::is_empty)
-    });
-    if free {
-        drop(delete_object(context, key).await);
-    }
-    Ok(())
 }
 
 fn remove_finalizer(object: &mut Value, name: &str) -> bool {
@@ -226,4 +242,36 @@ fn remove_reference(object: &mut Value, uid: &str) -> bool {
     let before = list.len();
     list.retain(|r| r["uid"] != uid);
     list.len() != before
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::*;
+    use crate::store::{Op, Precondition, Resource, memory};
+
+    /// Its last finalizer was taken off, and it was not removed: the controller ended in between.
+    #[tokio::test]
+    async fn what_is_left_over_is_removed() {
+        let dir = tempfile::tempdir().expect("a directory");
+        let context = crate::context::for_tests(dir.path(), memory::start().await);
+        let key = Key::namespaced(Resource::new("configmaps"), "default", "left");
+        let metadata = json!({
+            "name": "left", "namespace": "default", "uid": "u", "finalizers": [],
+            "deletionTimestamp": "2026-01-02T03:04:05Z", "deletionGracePeriodSeconds": 0,
+        });
+        let value = json!({"apiVersion": "v1", "kind": "ConfigMap", "metadata": metadata});
+        let put = Op::Put { key: key.clone(), value, precondition: Precondition::Absent };
+        context.store.apply_one(put).await.expect("it is written");
+        let mut watcher = watch_from_now(&context.store).await;
+        let _collects =
+            tokio_util::task::AbortOnDropHandle::new(tokio::spawn(run(Arc::clone(&context))));
+        let gone = async {
+            while context.store.get(&key).is_some() {
+                next_events(&mut watcher).await.expect("it does not fall behind");
+            }
+        };
+        tokio::time::timeout(Duration::from_secs(60), gone).await.expect("it goes");
+    }
 }

@@ -4,6 +4,7 @@
 //! Ready condition becomes Unknown and its tasks' phase Unknown. Reservations and leases stay: what
 //! runs there may still run. A node comes back through its session (see [`crate::session`]).
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -14,6 +15,8 @@ use muster_api::kind::node::Node;
 use muster_api::kind::task::Task;
 use muster_api::name::NodeName;
 use muster_api::phase::TaskPhase;
+use muster_controller_core::node_health::HEARTBEAT_EVERY;
+use tokio::time::Instant;
 
 use super::RETRY;
 use crate::context::Context;
@@ -25,24 +28,67 @@ use crate::store::StoreError;
 /// A restart takes at most this long and must disturb nobody.
 const RESTART_GRACE: Duration = Duration::from_secs(3);
 
+/// How long tasks are looked for that were bound to a node while it was marked.
+const MARK_FOR: Duration = Duration::from_secs(10);
+
 /// Works until dropped.
 pub async fn run(context: Arc<Context>, sessions: Arc<Sessions>) {
     presume(&context, &sessions);
+    let mut marked = Marked::default();
     loop {
-        let wait = async {
-            match sessions.next_silence() {
-                Some(deadline) => tokio::time::sleep_until(deadline).await,
-                None => std::future::pending().await,
-            }
-        };
+        let deadline = sessions.next_silence();
         tokio::select! {
-            () = wait => {}
+            () = until(deadline) => {}
+            () = until(marked.next()) => {
+                marked.look(&context, &sessions).await;
+                continue;
+            }
             // Somebody was heard for the first time: there is a deadline now.
             () = sessions.health_changed() => continue,
         }
+        // This process stood still, or the machine: what agents said meanwhile lies in their sockets, and is read first.
+        if deadline.is_some_and(|deadline| deadline.elapsed() > HEARTBEAT_EVERY / 2) {
+            tokio::time::sleep(HEARTBEAT_EVERY).await;
+        }
         let lost = sessions.silent_nodes();
+        let nodes: Vec<NodeName> = lost.iter().map(|(node, _)| node.clone()).collect();
         join_all(lost.into_iter().map(|(node, silence)| mark(&context, &sessions, node, silence)))
             .await;
+        marked.add(nodes);
+    }
+}
+
+async fn until(deadline: Option<Instant>) {
+    match deadline {
+        Some(deadline) => tokio::time::sleep_until(deadline).await,
+        None => std::future::pending().await,
+    }
+}
+
+/// Nodes that were just marked: a task may have been bound while that was written, and a bind whose fate was not known may
+/// be found on the disk later.
+#[derive(Debug, Default)]
+struct Marked(BTreeMap<NodeName, Instant>);
+
+impl Marked {
+    fn add(&mut self, nodes: Vec<NodeName>) {
+        let until = Instant::now() + MARK_FOR;
+        self.0.extend(nodes.into_iter().map(|node| (node, until)));
+    }
+
+    fn next(&self) -> Option<Instant> {
+        (!self.0.is_empty()).then(|| Instant::now() + RETRY)
+    }
+
+    async fn look(&mut self, context: &Context, sessions: &Sessions) {
+        let now = Instant::now();
+        self.0.retain(|node, until| *until > now && !sessions.is_heard(node));
+        for node in self.0.keys() {
+            if let Err(error) = mark_tasks(context, sessions, node).await {
+                let error = crate::app::chain(&error);
+                tracing::warn!(%node, error, "tasks of a silent node are not marked yet");
+            }
+        }
     }
 }
 
@@ -107,6 +153,14 @@ async fn mark_once(
         "NodeSilent",
         format!("the agent has not been heard for {silence:.1?}"),
     );
+    mark_tasks(context, sessions, node).await
+}
+
+async fn mark_tasks(
+    context: &Context,
+    sessions: &Sessions,
+    node: &NodeName,
+) -> Result<(), StoreError> {
     for key in sessions.board().tasks_on(node) {
         objects::change(&context.store, &key, |stored, mut task: Task| {
             let status = task.status.get_or_insert_default();

@@ -18,21 +18,27 @@ use crate::store::{Change, Key, Store, Stored};
 
 /// Works until dropped.
 pub async fn run(context: Arc<Context>, sessions: Arc<Sessions>) {
+    // What agents were told, also when this begins anew: what nobody wants any more is told them, too.
+    let mut known = BTreeMap::new();
     loop {
-        follow(&context, &sessions).await;
+        follow(&context, &sessions, &mut known).await;
     }
 }
 
 /// Says everything once, then what changes; ends when it must begin anew.
-async fn follow(context: &Context, sessions: &Sessions) {
+async fn follow(context: &Context, sessions: &Sessions, known: &mut BTreeMap<Key, Vec<ImagePull>>) {
     let mut watcher = watch_from_now(&context.store).await;
-    let mut known: BTreeMap<Key, Vec<ImagePull>> = BTreeMap::new();
-    for stored in &context.store.list(TASK_SETS, None).items {
-        take_in(context, sessions, &mut known, (Change::Put, stored));
+    let sets = context.store.list(TASK_SETS, None).items;
+    let gone = |key: &&Key| sets.iter().all(|stored| stored.key != **key);
+    for key in known.keys().filter(gone).cloned().collect::<Vec<_>>() {
+        say_again(context, sessions, known.remove(&key).unwrap_or_default().iter());
+    }
+    for stored in &sets {
+        take_in(context, sessions, known, (Change::Put, stored));
     }
     while let Some(events) = next_events(&mut watcher).await {
         for event in events.iter().filter(|event| event.object.key.resource == TASK_SETS) {
-            take_in(context, sessions, &mut known, (event.change, &event.object));
+            take_in(context, sessions, known, (event.change, &event.object));
         }
     }
 }
@@ -53,14 +59,20 @@ fn take_in(
     let now = if change == Change::Put { pulls(stored) } else { Vec::new() };
     let before = known.remove(&stored.key).unwrap_or_default();
     let other = |pull: &&ImagePull| !(before.contains(pull) && now.contains(pull));
-    let nodes: BTreeSet<&str> =
-        before.iter().chain(&now).filter(other).map(|pull| pull.node.as_str()).collect();
-    for node in nodes {
-        say(context, sessions, node);
-    }
+    say_again(context, sessions, before.iter().chain(&now).filter(other));
     if !now.is_empty() {
         known.insert(stored.key.clone(), now);
     }
+}
+
+/// The nodes of these are told what is wanted of them now.
+fn say_again<'a>(
+    context: &Context,
+    sessions: &Sessions,
+    pulls: impl Iterator<Item = &'a ImagePull>,
+) {
+    let nodes: BTreeSet<&str> = pulls.map(|pull| pull.node.as_str()).collect();
+    nodes.into_iter().for_each(|node| say(context, sessions, node));
 }
 
 fn say(context: &Context, sessions: &Sessions, node: &str) {

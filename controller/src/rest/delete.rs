@@ -81,6 +81,18 @@ pub fn waits_for_others(stored: &Stored) -> bool {
     metadata::is_ending(&object) && waits
 }
 
+/// Whether the object ends, nobody has anything to do before it goes, and it is there all the same: something kept it from
+/// going. A Task's reconciler, and a Namespace's, look after their own.
+#[must_use]
+pub fn is_left_over(stored: &Stored) -> bool {
+    let resource = stored.key.resource;
+    if resource == objects::TASKS || super::namespace::is_ours_to_end(resource) {
+        return false;
+    }
+    let object = stored.value();
+    metadata::is_ending(&object) && !metadata::has_finalizers(&object)
+}
+
 /// Deletes an object in this process, as a client's DELETE does: at once where nobody has to confirm anything.
 /// Returns the last state, or the state with its `deletionTimestamp`.
 ///

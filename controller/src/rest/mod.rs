@@ -43,6 +43,8 @@ mod exec;
 pub mod failure;
 mod fence;
 mod form;
+#[cfg(test)]
+mod hostile;
 mod join;
 mod list;
 pub mod log;
@@ -99,6 +101,7 @@ const BODY: Duration = Duration::from_secs(30);
 
 pub use rendered::Rendered;
 pub use stream::Streams;
+pub(crate) use update::operation as replacement;
 
 /// Bytes, ready to be an answer.
 pub(crate) type Answer = Result<Response, Failure>;

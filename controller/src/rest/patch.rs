@@ -15,9 +15,9 @@ use super::update::{Options, change};
 use super::{Answer, Call, admission, body, create, failure::Failure, metadata, owners, strategic};
 use crate::store::{DEEPEST, is_deeper};
 
-const MERGE: &str = "application/merge-patch+json";
-const STRATEGIC: &str = "application/strategic-merge-patch+json";
-const JSON: &str = "application/json-patch+json";
+pub(super) const MERGE: &str = "application/merge-patch+json";
+pub(super) const STRATEGIC: &str = "application/strategic-merge-patch+json";
+pub(super) const JSON: &str = "application/json-patch+json";
 pub(super) const APPLY: &str = "application/apply-patch+yaml";
 /// As many operations as Kubernetes takes.
 const OPERATIONS: usize = 10_000;
@@ -131,7 +131,7 @@ pub(super) async fn of_request(request: Request<Body>, core: bool) -> Result<Cha
     read(&media, &body::bytes(body).await?)
 }
 
-fn read(media: &str, bytes: &Bytes) -> Result<Change, Failure> {
+pub(super) fn read(media: &str, bytes: &Bytes) -> Result<Change, Failure> {
     let value = body::parse(bytes)?;
     if media == STRATEGIC {
         return Ok(Change::Strategic(value));

@@ -113,7 +113,7 @@ async fn write(
 }
 
 /// The same as an operation, while the object is what it was; none: nothing changed.
-pub(super) fn operation(present: &Stored, object: &Value) -> Option<Op> {
+pub(crate) fn operation(present: &Stored, object: &Value) -> Option<Op> {
     let old = present.value();
     if *object == old {
         return None;

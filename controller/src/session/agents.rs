@@ -7,7 +7,7 @@
 //!
 //! What the agent runs and should not is looked after in `strays`.
 
-use std::pin::Pin;
+use std::pin::{Pin, pin};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
@@ -214,6 +214,26 @@ impl From<Status> for End {
     }
 }
 
+/// The node was given up meanwhile and its tasks are Unknown: a new session tells everything anew.
+fn given_up() -> End {
+    Status::aborted("the node was silent for too long; say Hello again").into()
+}
+
+/// Does what waits for the disk. Nobody reads meanwhile what the agent says: that is no silence of the agent's.
+async fn heard_while<T>(
+    (sessions, node): (&Sessions, &NodeName),
+    work: impl Future<Output = Result<T, End>>,
+) -> Result<T, End> {
+    let mut work = pin!(work);
+    loop {
+        match tokio::time::timeout(HEARTBEAT_EVERY, &mut work).await {
+            Ok(done) => return done,
+            Err(_) if sessions.heard(node) => return Err(given_up()),
+            Err(_) => {}
+        }
+    }
+}
+
 impl Session {
     async fn run(mut self) {
         let stop = self.context.stop.clone();
@@ -264,7 +284,8 @@ impl Session {
         // Heard before it is written that it is ready: whoever is about to write that it is silent looks
         // at this again, and must not overwrite the newer word with the older one.
         self.sessions.heard(&self.node);
-        self.write_hello(&speaker, &hello).await?;
+        let (sessions, node) = (Arc::clone(&self.sessions), self.node.clone());
+        heard_while((&sessions, &node), self.write_hello(&speaker, &hello)).await?;
         hello_written.store(true, Ordering::Release);
         drop(beginning);
         self.send(ToAgent::Welcome(welcome())).await?;
@@ -370,10 +391,14 @@ impl Session {
         match body {
             Some(FromAgent::Heartbeat(heartbeat)) => self.take_heartbeat(heartbeat).await,
             Some(FromAgent::Pose(pose)) => self.take_pose(&pose),
-            Some(FromAgent::Task(report)) => self.take_report(&report).await,
+            Some(FromAgent::Task(report)) => {
+                let (sessions, node) = (Arc::clone(&self.sessions), self.node.clone());
+                heard_while((&sessions, &node), self.take_report(&report)).await
+            }
             Some(FromAgent::Node(state)) => {
                 self.is_newest()?;
-                self.take_node(speaker, Some(&state)).await
+                let (sessions, node) = (Arc::clone(&self.sessions), self.node.clone());
+                heard_while((&sessions, &node), self.take_node(speaker, Some(&state))).await
             }
             Some(FromAgent::Log(chunk)) => {
                 let id = chunk.id;
@@ -408,8 +433,7 @@ impl Session {
     async fn take_heartbeat(&mut self, heartbeat: wire::Heartbeat) -> Result<(), End> {
         self.is_admitted()?;
         if self.sessions.heard(&self.node) {
-            // It was given up meanwhile and its tasks are Unknown: a new session tells everything anew.
-            return Err(Status::aborted("the node was silent for too long; say Hello again").into());
+            return Err(given_up());
         }
         if let Some(pose) = &heartbeat.pose {
             self.take_pose(pose)?;
@@ -505,5 +529,30 @@ fn welcome() -> wire::Welcome {
         controller: env!("CARGO_PKG_VERSION").to_owned(),
         heartbeat_interval_ms: millis(HEARTBEAT_EVERY),
         detect_after_ms: millis(DETECT_AFTER),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[tokio::test(start_paused = true)]
+    async fn an_agent_is_not_silent_while_nobody_listens() {
+        let (sessions, node) = (Sessions::default(), NodeName::new("robot").unwrap());
+        sessions.heard(&node);
+        let slow = async {
+            tokio::time::sleep(DETECT_AFTER * 5).await;
+            Ok(sessions.silent_nodes())
+        };
+        let silent = heard_while((&sessions, &node), slow).await;
+        assert!(silent.is_ok_and(|silent| silent.is_empty()));
+        tokio::time::sleep(DETECT_AFTER * 2).await;
+        assert_eq!(sessions.silent_nodes().len(), 1, "now it is its own silence");
+        // Given up before: a session that goes on would leave its tasks Unknown.
+        let slow = async {
+            tokio::time::sleep(DETECT_AFTER).await;
+            Ok(())
+        };
+        assert!(heard_while((&sessions, &node), slow).await.is_err());
     }
 }

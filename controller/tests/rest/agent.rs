@@ -1,5 +1,6 @@
 //! An agent that does what a test says: it joins with a token, speaks the session, and runs nothing.
 
+use std::collections::BTreeSet;
 use std::sync::Arc;
 
 use http::Uri;
@@ -118,6 +119,8 @@ pub(crate) struct Session {
     say: mpsc::Sender<wire::AgentMessage>,
     heard: Streaming<wire::ControllerMessage>,
     beats: JoinHandle<()>,
+    /// Uids of the tasks that it was told of.
+    known: BTreeSet<String>,
 }
 
 impl Drop for Session {
@@ -156,11 +159,19 @@ impl Session {
                 }
             }
         });
-        Ok(Self { say, heard, beats })
+        Ok(Self { say, heard, beats, known: BTreeSet::new() })
     }
 
     pub(crate) async fn say(&self, report: wire::TaskReport) {
         self.say.send(wire::AgentMessage { body: Some(Say::Task(report)) }).await.unwrap();
+    }
+
+    /// The same once it was told of the task, as an agent would: a task that is bound is on its way to it.
+    pub(crate) async fn say_of(&mut self, report: wire::TaskReport) {
+        if !self.known.contains(&report.uid) {
+            self.assigned(&report.uid).await;
+        }
+        self.say(report).await;
     }
 
     pub(crate) async fn say_pose(&self, pose: wire::Pose) {
@@ -174,7 +185,10 @@ impl Session {
             let message = tokio::time::timeout(super::support::DEADLINE, self.heard.message());
             let message = message.await.expect("an answer in time")?;
             match message.and_then(|m| m.body) {
-                Some(Hear::Assignments(page)) => return Ok(page),
+                Some(Hear::Assignments(page)) => {
+                    self.known.extend(page.upserts.iter().map(|a| a.uid.clone()));
+                    return Ok(page);
+                }
                 Some(_) => {}
                 None => return Err(Status::cancelled("the stream ended without a word")),
             }

@@ -48,11 +48,22 @@ impl Publisher {
         map: &str,
         poses: Vec<wire::NodePose>,
     ) -> wire::PoseReply {
-        let (source, map) = (source.to_owned(), map.to_owned());
-        let batch = wire::PoseBatch { sequence: 7, source, map, poses, acknowledge: true };
-        self.batches.send(batch).await.unwrap();
+        self.send(source, map, poses, true).await;
         let reply = tokio::time::timeout(DEADLINE, self.replies.message()).await;
         reply.expect("a reply in time").unwrap().expect("the stream goes on")
+    }
+
+    /// Publishes; it is answered if that is asked for or something is refused.
+    async fn send(
+        &mut self,
+        source: &str,
+        map: &str,
+        poses: Vec<wire::NodePose>,
+        acknowledge: bool,
+    ) {
+        let (source, map) = (source.to_owned(), map.to_owned());
+        let batch = wire::PoseBatch { sequence: 7, source, map, poses, acknowledge };
+        self.batches.send(batch).await.unwrap();
     }
 
     async fn moves(&mut self, node: &str, x: f64) {
@@ -265,7 +276,12 @@ async fn a_slow_reader_sees_the_latest_and_holds_nobody_up() {
     publisher.known(&names.iter().map(String::as_str).collect::<Vec<_>>()).await;
     for frame in 1..=FRAMES {
         let poses = names.iter().map(|name| at(name, frame as f64)).collect();
-        assert_eq!(publisher.say("mocap", "", poses).await.taken as usize, ROBOTS);
+        // One that waited for an answer to each would be no faster than who passes them on.
+        if frame % 10 == 0 {
+            assert_eq!(publisher.say("mocap", "", poses).await.taken as usize, ROBOTS);
+        } else {
+            publisher.send("mocap", "", poses, false).await;
+        }
     }
     let (mut lines, mut arrived) = (0, 0);
     while arrived < ROBOTS {

@@ -61,7 +61,7 @@ async fn a_robot_that_leaves_loses_its_task_when_its_mission_is_over_and_another
     let placed = at(&near, cluster.until(T, |task| text(task, "/status/phase") == "Bound")).await;
     assert_eq!(text(&placed, "/status/node"), "r1");
     let uid = text(&placed, "/metadata/uid").to_owned();
-    one.say(report(&uid, 1, Running)).await;
+    one.say_of(report(&uid, 1, Running)).await;
 
     // It is on a mission when it leaves.
     let lock = |value: Value| {

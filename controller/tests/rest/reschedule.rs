@@ -55,9 +55,9 @@ fn failed(uid: &str, failed_attempts: u32) -> wire::TaskReport {
     }
 }
 
-async fn say(robots: &[(String, Session)], node: &str, report: wire::TaskReport) {
-    let (_, session) = robots.iter().find(|(name, _)| name == node).unwrap();
-    session.say(report).await;
+async fn say(robots: &mut [(String, Session)], node: &str, report: wire::TaskReport) {
+    let (_, session) = robots.iter_mut().find(|(name, _)| name == node).unwrap();
+    session.say_of(report).await;
 }
 
 fn reasons(task: &Value) -> Vec<&str> {
@@ -84,8 +84,8 @@ async fn it_goes_from_node_to_node_under_new_uids_and_ends_with_what_was_tried()
     let map = json!({"apiVersion": "v1", "kind": "ConfigMap", "metadata": {"name": "m", "ownerReferences": owner}});
     assert_eq!(send(&admin, "POST", MAPS, map).await.0, 201);
 
-    say(&robots, &node, report(&first, 1, Running)).await;
-    say(&robots, &node, failed(&first, 1)).await;
+    say(&mut robots, &node, report(&first, 1, Running)).await;
+    say(&mut robots, &node, failed(&first, 1)).await;
     let held = cluster.until(T, |task| reasons(task).contains(&"BackOff")).await;
     assert_eq!(reasons(&held), ["BackOff", "TriedBefore"]);
     assert_eq!(text(&held, "/status/why/1/node"), node);
@@ -108,12 +108,12 @@ async fn it_goes_from_node_to_node_under_new_uids_and_ends_with_what_was_tried()
     let map = cluster.until(&map, |m| text(m, "/metadata/ownerReferences/0/uid") == second).await;
     assert_eq!(text(&map, "/metadata/ownerReferences/0/kind"), "Task");
 
-    say(&robots, &other, failed(&second, 2)).await;
+    say(&mut robots, &other, failed(&second, 2)).await;
     // Both have failed once, so either may take it; one attempt is left.
     let (third, last, _) = placed(&cluster, &[first.clone(), second.clone()]).await;
     let session = &mut robots.iter_mut().find(|(name, _)| *name == last).unwrap().1;
     assert_eq!(session.assigned(&third).await.attempts, 1);
-    say(&robots, &last, failed(&third, 1)).await;
+    say(&mut robots, &last, failed(&third, 1)).await;
     let end = cluster.until(T, |task| text(task, "/status/reason") == "AttemptsExhausted").await;
     assert_eq!(text(&end, "/metadata/uid"), third);
     assert_eq!(text(&end, "/status/phase"), "Failed");
@@ -129,12 +129,12 @@ async fn it_goes_from_node_to_node_under_new_uids_and_ends_with_what_was_tried()
 async fn a_watch_sees_one_go_and_the_next_come_in_the_next_revision() {
     let cluster = Cluster::start().await;
     let admin = cluster.admin().await;
-    let robots = robots(&cluster).await;
+    let mut robots = robots(&cluster).await;
     send(&admin, "POST", TASKS, retried(json!({"backoff": "1h", "maxBackoff": "1h"}))).await;
     let (uid, node, _) = placed(&cluster, &[]).await;
     let store = &cluster.running.context().store;
     let mut changes = store.watch_all(store.revision()).unwrap();
-    say(&robots, &node, failed(&uid, 1)).await;
+    say(&mut robots, &node, failed(&uid, 1)).await;
     let mut seen: Vec<(u64, String, String)> = Vec::new();
     while !seen.iter().any(|(_, change, of)| change == "Put" && *of != uid) {
         for event in changes.next().await.unwrap() {
@@ -158,20 +158,20 @@ async fn a_watch_sees_one_go_and_the_next_come_in_the_next_revision() {
 async fn its_deadline_counts_over_all_nodes_and_its_ttl_from_the_last_end() {
     let cluster = Cluster::start().await;
     let admin = cluster.admin().await;
-    let robots = robots(&cluster).await;
+    let mut robots = robots(&cluster).await;
     let mut task = retried(json!({"backoff": "1h", "maxBackoff": "1h"}));
-    task["spec"]["activeDeadlineSeconds"] = 2.into();
+    task["spec"]["activeDeadlineSeconds"] = 8.into();
     task["spec"]["ttlSecondsAfterFinished"] = 3600.into();
     send(&admin, "POST", TASKS, task).await;
     let (uid, node, _) = placed(&cluster, &[]).await;
-    say(&robots, &node, failed(&uid, 1)).await;
+    say(&mut robots, &node, failed(&uid, 1)).await;
     let end = cluster
         .until(T, |task| {
             text(task, "/status/phase") == "Failed" && text(task, "/metadata/uid") != uid
         })
         .await;
     assert_eq!(text(&end, "/status/reason"), "DeadlineExceeded");
-    assert_eq!(text(&end, "/status/message"), "was under way for 2 s, its activeDeadlineSeconds");
+    assert_eq!(text(&end, "/status/message"), "was under way for 8 s, its activeDeadlineSeconds");
     assert_eq!(end["status"]["earlier"][0]["node"], node.as_str());
 
     // One that is over at once when it ends is not taken away before it is tried elsewhere.
@@ -180,9 +180,9 @@ async fn its_deadline_counts_over_all_nodes_and_its_ttl_from_the_last_end() {
     task["spec"]["ttlSecondsAfterFinished"] = 0.into();
     assert_eq!(send(&admin, "POST", TASKS, task).await.0, 201);
     let (first, node, _) = placed(&cluster, std::slice::from_ref(&uid)).await;
-    say(&robots, &node, failed(&first, 1)).await;
+    say(&mut robots, &node, failed(&first, 1)).await;
     let (second, node, _) = placed(&cluster, &[uid, first]).await;
-    say(&robots, &node, failed(&second, 1)).await;
+    say(&mut robots, &node, failed(&second, 1)).await;
     cluster.until(T, |answer| answer["reason"] == "NotFound").await;
     cluster.running.shut_down().await.unwrap();
 }
@@ -191,7 +191,7 @@ async fn its_deadline_counts_over_all_nodes_and_its_ttl_from_the_last_end() {
 async fn its_place_in_the_quota_stays_its_own() {
     let cluster = Cluster::start().await;
     let admin = cluster.admin().await;
-    let robots = robots(&cluster).await;
+    let mut robots = robots(&cluster).await;
     let quota = json!({
         "apiVersion": "muster.dev/v1alpha1", "kind": "Quota", "metadata": {"name": "default"},
         "spec": {"hard": {"tasks": 1}},
@@ -214,10 +214,10 @@ async fn its_place_in_the_quota_stays_its_own() {
             }
         })
     };
-    say(&robots, &node, failed(&first, 1)).await;
+    say(&mut robots, &node, failed(&first, 1)).await;
     let (second, node, _) = placed(&cluster, &[first]).await;
     assert!(!asking.is_finished());
-    say(&robots, &node, failed(&second, 1)).await;
+    say(&mut robots, &node, failed(&second, 1)).await;
     let then = tokio::time::timeout(DEADLINE, asking).await.unwrap().unwrap();
     assert_eq!(text(&then, "/metadata/uid"), second);
     assert_eq!(text(&then, "/status/phase"), "Failed");
@@ -228,13 +228,13 @@ async fn its_place_in_the_quota_stays_its_own() {
 async fn who_waits_for_it_goes_on_waiting_and_a_deleted_one_stays_away() {
     let cluster = Cluster::start().await;
     let admin = cluster.admin().await;
-    let robots = robots(&cluster).await;
+    let mut robots = robots(&cluster).await;
     send(&admin, "POST", TASKS, retried(json!({"backoff": "1h", "maxBackoff": "1h"}))).await;
     let mut after = task("after");
     after["spec"]["dependsOn"] = json!([{"task": "t", "condition": "Succeeded"}]);
     send(&admin, "POST", TASKS, after).await;
     let (first, node, _) = placed(&cluster, &[]).await;
-    say(&robots, &node, failed(&first, 1)).await;
+    say(&mut robots, &node, failed(&first, 1)).await;
     let path = format!("{TASKS}/after");
     let pending = "waits for task t, which is Pending, not yet Succeeded";
     cluster.until(&path, |task| text(task, "/status/why/0/message") == pending).await;
@@ -252,10 +252,10 @@ async fn who_waits_for_it_goes_on_waiting_and_a_deleted_one_stays_away() {
 async fn a_wait_outlives_the_controller() {
     let cluster = Cluster::start().await;
     let admin = cluster.admin().await;
-    let robots_before = robots(&cluster).await;
+    let mut robots_before = robots(&cluster).await;
     send(&admin, "POST", TASKS, retried(json!({"backoff": "1s"}))).await;
     let (first, node, _) = placed(&cluster, &[]).await;
-    say(&robots_before, &node, failed(&first, 1)).await;
+    say(&mut robots_before, &node, failed(&first, 1)).await;
     let waits = cluster.until(T, |task| text(task, "/metadata/uid") != first).await;
     let uid = text(&waits, "/metadata/uid").to_owned();
     drop(robots_before);

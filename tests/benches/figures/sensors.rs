@@ -7,6 +7,7 @@
 use std::io::Write as _;
 use std::time::{Duration, Instant};
 
+use muster_api::phase::TaskPhase;
 use muster_ros1::node::{PublishOptions, SubscribeOptions};
 use muster_ros1::sensor_msgs::Image;
 use muster_ros1::{Node, NodeOptions};
@@ -168,6 +169,9 @@ async fn start(cluster: &Cluster, readers: usize, command: &[&str], sensors: Val
             "gracePeriodSeconds": 0,
         });
         cluster.create(&format!("r{reader}"), spec).await;
+    }
+    for reader in 0..readers {
+        cluster.task(&format!("r{reader}"), "running", |s| s.phase == TaskPhase::Running).await;
     }
 }
 

@@ -84,7 +84,7 @@ async fn a_driver_that_lives_after_all_keeps_the_next_one_waiting() {
     let mut cluster = Cluster::start().await;
     // It does not end at SIGTERM, so that there is a time in which both could drive.
     let stubborn = "trap '' TERM; while :; do sleep 0.1; done";
-    let first = driven(&mut cluster, stubborn, 3).await;
+    let first = driven(&mut cluster, stubborn, 10).await;
     lose(&mut cluster).await;
     fence(&cluster).await;
     assert_ne!(kernel::with_env("MUSTER_UID", &first), [], "only the agent was killed");

@@ -78,6 +78,8 @@ async fn a_robot_is_driven_by_its_holder_and_stopped_by_a_person() {
     // A person stops it. The holder stays the holder, and nothing of it passes.
     let said = muster(&cluster, &["estop", "robot"]);
     assert_eq!((said.0, said.1.as_str()), (0, "node/robot stopped (Settle)\n"), "{}", said.2);
+    // The driver has it by now, and writes it down a moment later.
+    robot.wait("stop").await;
     let heard = robot.heard();
     assert_eq!(heard.last().map(String::as_str), Some("stop"));
     let message = condition(&cluster, "EmergencyStop", "True").await;

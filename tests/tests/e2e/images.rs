@@ -91,7 +91,7 @@ async fn an_image_that_cannot_be_pulled_ends_no_task_and_the_rollout_at_its_dead
     .await;
 }
 
-/// The revision of the first change after `from` that is as wanted, and whose it is.
+/// The revisions of the first changes after `from` that are as wanted on either node, by node.
 async fn first<K>(
     api: &Api<K>,
     from: &str,
@@ -100,11 +100,13 @@ async fn first<K>(
 where
     K: Resource + Clone + std::fmt::Debug + DeserializeOwned,
 {
-    // What has been is told at once; the watch ends by itself a moment later.
-    let params = WatchParams::default().timeout(2);
+    // What has been is told at once, or as soon as a busy controller comes to it.
+    let params = WatchParams::default().timeout(60);
     let mut events = api.watch(&params, from).await.expect("a watch").boxed();
     let mut found = BTreeMap::new();
-    while let Some(event) = events.next().await {
+    while found.len() < 2
+        && let Some(event) = events.next().await
+    {
         if let Ok(WatchEvent::Added(object) | WatchEvent::Modified(object)) = event
             && let Some(key) = wanted(&object)
         {
@@ -112,6 +114,7 @@ where
             found.entry(key).or_insert_with(|| revision.parse().expect("a number"));
         }
     }
+    assert_eq!(found.len(), 2, "{found:?}");
     found
 }
 

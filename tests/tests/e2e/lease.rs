@@ -1,7 +1,7 @@
 //! A lease passes on only after the last process of its holder is gone.
 
 use muster_api::phase::TaskPhase;
-use muster_tests::{AgentOptions, Cluster, kernel};
+use muster_tests::{AgentOptions, Cluster, kernel, wait};
 use serde_json::json;
 
 fn driver(script: &str, grace: u32) -> serde_json::Value {
@@ -21,7 +21,11 @@ async fn a_holder_that_ignores_sigterm_keeps_the_lease_until_it_is_killed() {
     let holder = cluster.create("holder", driver(stubborn, 2)).await;
     cluster.phase("holder", TaskPhase::Running).await;
     let uid = holder.metadata.uid.expect("set by the server");
-    assert!(kernel::with_env("MUSTER_UID", &uid).len() >= 2, "the task and its child run");
+    wait::until("the task and its child", || {
+        let run = kernel::with_env("MUSTER_UID", &uid);
+        async move { if run.len() >= 2 { Ok(()) } else { Err(format!("{run:?}")) } }
+    })
+    .await;
 
     cluster.create("next", driver("sleep 1000", 0)).await;
     cluster

@@ -102,9 +102,14 @@ fn spec(cpu: &str) -> Value {
     json!({"resources": {"cpu": cpu}, "run": {"process": {"command": ["true"]}}})
 }
 
+/// Without Docker, which a node may find after it is ready: then what it offers is offered anew.
+fn small(name: &str, x: f64) -> AgentOptions {
+    AgentOptions::robot(name, x, 0.0).flag("--cpu", "1").flag("--docker-socket", "none")
+}
+
 async fn one_robot() -> Cluster {
     let mut cluster = Cluster::start().await;
-    cluster.join(AgentOptions::robot("turtle", 0.0, 0.0).flag("--cpu", "1")).await;
+    cluster.join(small("turtle", 0.0)).await;
     cluster
 }
 
@@ -170,7 +175,7 @@ async fn a_live_controller_says_what_is_offered_and_why_the_rest_is_not() {
     let why =
         |name: &str| format!("/apis/muster.dev/v1alpha1/namespaces/default/frameworks/{name}/why");
     let mut cluster = one_robot().await;
-    cluster.join(AgentOptions::robot("tortoise", 9.0, 0.0).flag("--cpu", "1")).await;
+    cluster.join(small("tortoise", 9.0)).await;
     let near = json!({"name": "near", "position": {"x": 3.0, "y": 0.0, "radius": 5.0}});
     let mut near = Session::open(&cluster, near).await;
     let offer = near.offer().await;

@@ -134,22 +134,36 @@ async fn messages_go_on_while_the_controller_is_away_and_after_it_is_back() {
         }
     }
     cluster.node_ready("cloud").await;
-    // The connection is made again, with a ticket of the new session; what is under way then may be lost, and its
-    // sender is told.
-    let mut back = 0;
-    wait::until("directly again", || {
-        let sent = echo.handle.clone();
-        let executor = echo.executor.clone();
-        async move {
-            let taken = sent.send_framework_message(&executor, numbered(1_000)).await;
-            taken.map_err(|refused| refused.to_string())
+    // The connection is made again, with a ticket of the new session; what is under way then may be lost.
+    let back = tokio::time::timeout(wait::DEADLINE, async {
+        let mut ticks = tokio::time::interval(Duration::from_millis(20));
+        let (mut last, mut next) = (19, 1_000);
+        loop {
+            ticks.tick().await;
+            if comes_back(&mut echo, &mut last, next).await {
+                return;
+            }
+            next += 1;
         }
-    })
-    .await;
-    while back == 0 {
-        back = number(&echo.answer().await);
-    }
+    });
+    back.await.expect("messages go there and back again in time");
     echo.go_directly(&cluster).await;
+}
+
+/// Sends a number; whether just that comes back soon. What comes before it is later than `last`, which goes on.
+async fn comes_back(echo: &mut Echo, last: &mut u64, sent: u64) -> bool {
+    let taken = echo.handle.send_framework_message(&echo.executor, numbered(sent)).await;
+    if taken.is_err() {
+        return false;
+    }
+    let heard = async {
+        while *last != sent {
+            let number = number(&echo.answer().await);
+            assert!(*last < number && number <= sent, "{number} after {last}, of {sent}");
+            *last = number;
+        }
+    };
+    tokio::time::timeout(Duration::from_secs(5), heard).await.is_ok()
 }
 
 /// Numbered messages go there and back while agents and connections are killed. Some are lost; none comes twice or late.

@@ -75,7 +75,7 @@ async fn a_robot_on_a_mission_is_left_alone_whoever_says_so_there() {
     assert_eq!((&*status.held[0].node, &*status.held[0].holder), ("robot", "task default/mission"));
     let (code, _, err) = muster(&cluster, &["node", "unlock", "robot"]);
     assert!(code != 0 && err.contains("on the robot itself"), "{err}");
-    let (code, out, _) = muster(&cluster, &["drain", "robot", "--timeout=300ms"]);
+    let (code, out, _) = muster(&cluster, &["drain", "robot", "--timeout=5s"]);
     assert!(code != 0 && out.contains("waiting for the mission of task default/mission"), "{out}");
     cluster.phase("mission", TaskPhase::Running).await;
     assert_eq!(muster(&cluster, &["uncordon", "robot"]).0, 0);

@@ -1,7 +1,7 @@
 //! A more important task takes the place of others, gracefully; and what has run long enough ends.
 
 use muster_api::phase::TaskPhase;
-use muster_tests::{AgentOptions, Cluster, kernel};
+use muster_tests::{AgentOptions, Cluster, kernel, wait};
 use serde_json::{Value, json};
 
 fn driver(script: &str, priority: i32) -> Value {
@@ -9,7 +9,8 @@ fn driver(script: &str, priority: i32) -> Value {
         "priority": priority,
         "resources": {"actuators": ["base:Drive"], "cpu": "100m"},
         "run": {"process": {"command": ["sh", "-c", script]}},
-        "gracePeriodSeconds": 2,
+        // So long, in which it is seen that the place is being made.
+        "gracePeriodSeconds": 10,
     })
 }
 
@@ -21,7 +22,11 @@ async fn a_lease_is_taken_only_after_its_old_holder_is_gone() {
     let holder = cluster.create("holder", driver(stubborn, 0)).await;
     cluster.phase("holder", TaskPhase::Running).await;
     let uid = holder.metadata.uid.expect("set by the server");
-    assert!(kernel::with_env("MUSTER_UID", &uid).len() >= 2, "the task and its child run");
+    wait::until("the task and its child", || {
+        let run = kernel::with_env("MUSTER_UID", &uid);
+        async move { if run.len() >= 2 { Ok(()) } else { Err(format!("{run:?}")) } }
+    })
+    .await;
 
     cluster.create("urgent", driver("sleep 1000", 10)).await;
     let nominated = |s: &muster_api::kind::task::TaskStatus| {
@@ -59,12 +64,9 @@ async fn a_deadline_ends_a_task_and_its_object_goes_when_it_should() {
     let brief = json!({"run": run("true"), "ttlSecondsAfterFinished": 1});
     cluster.create("brief", brief).await;
     let tasks = cluster.tasks().await;
-    muster_tests::wait::object(
-        tasks,
-        "brief",
-        "removed",
-        |task: Option<&muster_api::kind::task::Task>| task.is_none(),
-    )
+    wait::object(tasks, "brief", "removed", |task: Option<&muster_api::kind::task::Task>| {
+        task.is_none()
+    })
     .await;
     cluster.phase("long", TaskPhase::Failed).await;
 }

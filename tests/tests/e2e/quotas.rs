@@ -56,7 +56,8 @@ fn cpu_time(pid: u32) -> Duration {
 
 /// Cores that a task's group gets in some seconds, from the kernel's account of it.
 async fn share(pid: u32) -> f64 {
-    let (cpu, wall) = (cpu_time(pid), Instant::now());
+    // The clock goes around the account: what is read late makes the share smaller, never larger than it was.
+    let (wall, cpu) = (Instant::now(), cpu_time(pid));
     wait::until("measured", || async move {
         if wall.elapsed() > Duration::from_secs(4) { Ok(()) } else { Err("measuring".to_owned()) }
     })

@@ -1,16 +1,26 @@
 //! A task that fails on one robot and does its work on the next, followed by the commands that people follow it with.
 
-use std::process::{Command, Stdio};
+use std::path::Path;
+use std::process::Stdio;
 
 use muster_api::kind::task::TaskStatus;
 use muster_api::phase::TaskPhase;
-use muster_tests::{AgentOptions, Cluster, cluster::binary};
+use muster_tests::{AgentOptions, Cluster, cluster::binary, wait};
 use serde_json::json;
+use tokio::io::{AsyncBufReadExt as _, BufReader};
+use tokio::process::Command;
 
 use crate::cli::muster;
 
-/// It breaks on the robot `near`, and works elsewhere.
-const SCRIPT: &str = "if [ $MUSTER_NODE = near ]; then echo broken here; sleep 1; exit 3; fi; echo works here; sleep 1";
+/// It breaks on the robot `near`, and works elsewhere; either when the test has made a file for it.
+fn script(broken: &Path, works: &Path) -> String {
+    let until = |file: &Path| format!("until [ -e {} ]; do sleep 0.05; done", file.display());
+    format!(
+        "if [ $MUSTER_NODE = near ]; then echo broken here; {}; exit 3; fi; echo works here; {}",
+        until(broken),
+        until(works)
+    )
+}
 
 fn manifest(command: &str, backoff: &str) -> String {
     format!(
@@ -39,22 +49,30 @@ fn apply(cluster: &Cluster, text: &str) {
 #[tokio::test(flavor = "multi_thread")]
 async fn commands_follow_a_task_from_robot_to_robot() {
     let cluster = two_robots().await;
-    apply(&cluster, &manifest(SCRIPT, "500ms"));
+    let (broken, works) = (cluster.dir().join("broken"), cluster.dir().join("works"));
+    apply(&cluster, &manifest(&script(&broken, &works), "500ms"));
     let running = cluster.phase("work", TaskPhase::Running).await;
     let first = running.metadata.uid.clone().expect("it has one");
-    let logs = Command::new(binary("muster"))
+    let mut logs = Command::new(binary("muster"))
         .args(["logs", "-f", "work"])
         .env("MUSTER_CONFIG", cluster.kubeconfig())
         .stdout(Stdio::piped())
         .stderr(Stdio::piped())
+        .kill_on_drop(true)
         .spawn()
         .expect("it starts");
+    let mut lines = BufReader::new(logs.stdout.take().expect("it is piped")).lines();
+    for (line, file) in [("broken here", &broken), ("works here", &works)] {
+        let said = tokio::time::timeout(wait::DEADLINE, lines.next_line()).await;
+        let said = said.unwrap_or_else(|_| panic!("no {line:?} in time"));
+        assert_eq!(said.expect("it can be read").as_deref(), Some(line));
+        std::fs::write(file, "").expect("a file");
+    }
     let (code, out, err) =
         muster(&cluster, &["wait", "task/work", "--for=phase=Succeeded", "--timeout=60s"]);
     assert_eq!((code, out.as_str()), (0, "task/work is Succeeded\n"), "{err}");
-    let logs = tokio::task::spawn_blocking(|| logs.wait_with_output()).await;
-    let logs = logs.expect("it does not panic").expect("it is ours");
-    assert_eq!(String::from_utf8_lossy(&logs.stdout), "broken here\nworks here\n");
+    assert_eq!(lines.next_line().await.expect("it can be read"), None);
+    let logs = logs.wait_with_output().await.expect("it is ours");
     let said = String::from_utf8_lossy(&logs.stderr);
     assert!(said.contains("task/work goes on on far"), "{said}");
 

@@ -186,15 +186,16 @@ async fn a_slow_reader_loses_frames_of_its_own() {
     let _robot = Robot::join(&mut cluster, 20).await;
     create(&cluster, "slow", reads(IMAGE, &["1", "0.7"])).await;
     create(&cluster, "fast", reads(IMAGE, &["16"])).await;
-    let slow = until(&cluster, "slow", "frames", |said| said.len() >= 6).await;
-    let fast = said(&cluster, "fast").await;
-    check(&slow);
-    check(&fast);
     let dropped =
         |frames: &[Value]| frames.iter().filter_map(|f| f["dropped"].as_u64()).sum::<u64>();
     // 20 a second, of which it takes fewer than two.
-    assert!(dropped(&slow) > 20, "{slow:?}");
-    assert!(dropped(&fast) <= fast.len() as u64 / 4, "{} of {}", dropped(&fast), fast.len());
+    let is_behind = |said: &[Value]| said.len() >= 6 && dropped(said) > 20;
+    let slow = until(&cluster, "slow", "behind", is_behind).await;
+    // A busy machine may hold it up at first, and not for good.
+    let keeps_up = |said: &[Value]| said.len() >= 20 && dropped(said) <= said.len() as u64 / 4;
+    let fast = until(&cluster, "fast", "keeping up", keeps_up).await;
+    check(&slow);
+    check(&fast);
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -230,8 +231,7 @@ async fn why_nothing_comes_is_told_where_people_look() {
     };
     wait::object(cluster.nodes().await, "robot", "failing", fails).await;
     let path = task_dir(&cluster, &task).join("sensors/status.json");
-    let status = std::fs::read_to_string(&path).expect("it is written");
-    assert!(status.contains("Failing") && status.contains("not plugged in"), "{status}");
+    told(&path, &["Failing", "not plugged in"]).await;
 
     write("n=0; while :; do n=$((n+1)); echo \"scan $n\"; sleep 0.05; done");
     let frames = until(&cluster, "laser", "scans", |said| said.len() >= 3).await;
@@ -239,11 +239,7 @@ async fn why_nothing_comes_is_told_where_people_look() {
     let ready =
         |n: Option<&Node>| condition(n, "SensorsReady").is_some_and(|(status, _)| status == "True");
     wait::object(cluster.nodes().await, "robot", "ready", ready).await;
-    wait::until("its word in the task's directory", async || {
-        let status = std::fs::read_to_string(&path).expect("it is written");
-        if status.contains("Delivering") { Ok(()) } else { Err(status) }
-    })
-    .await;
+    told(&path, &["Delivering"]).await;
 
     // A FIFO that has no writer yet is waited for.
     create(&cluster, "gps", reads(IMAGE, &["4"])).await;
@@ -295,6 +291,17 @@ async fn containers_and_other_users_read_too() {
         watched(&cluster, task, "another life", anew).await;
     }
     cluster.delete("box").await;
+}
+
+/// Waits until the file in a task's directory says all of these words of its sensors.
+async fn told(path: &Path, words: &[&str]) {
+    wait::until(&format!("{words:?} in the task's directory"), async || {
+        match std::fs::read_to_string(path) {
+            Ok(status) if words.iter().all(|word| status.contains(word)) => Ok(()),
+            other => Err(format!("{other:?}")),
+        }
+    })
+    .await;
 }
 
 /// Waits until the numbers of the frames that `watch` has said are as wanted.

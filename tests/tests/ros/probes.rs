@@ -1,7 +1,7 @@
 //! Probes of topics: a task is Ready while a real topic is published often enough, and is ended when it should not be silent.
 
 use muster_api::kind::task::TaskStatus;
-use muster_tests::{AgentOptions, Cluster, Ros};
+use muster_tests::{AgentOptions, Cluster, Ros, wait};
 use serde_json::{Value, json};
 
 async fn one_robot() -> Cluster {
@@ -35,8 +35,10 @@ async fn not_ready(cluster: &Cluster, task: &str, words: &str) -> String {
     cluster.task(task, words, is).await.status.expect("it has one").message
 }
 
-async fn ready(cluster: &Cluster, task: &str) {
-    cluster.task(task, "ready", |s| s.ready == Some(true)).await;
+/// Waits until a task is Ready.
+async fn ready(cluster: &Cluster, task: &str) -> TaskStatus {
+    let task = cluster.task(task, "ready", |s| s.ready == Some(true)).await;
+    task.status.expect("it has one")
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -45,7 +47,7 @@ async fn readiness_follows_a_topics_rate_and_two_probes_share_a_subscription() {
     let master = ros.master();
     let env = [("ROS_MASTER_URI", master.as_str()), ("ROS_NAMESPACE", "/r1")];
     cluster.create("watch", sleeps(&env, topic("chatter", 8.0, "1s"))).await;
-    let mut explicit = topic("/r1/chatter", 1.0, "2500ms");
+    let mut explicit = topic("/r1/chatter", 0.4, "5s");
     explicit["topic"]["master"] = master.as_str().into();
     cluster.create("slow", sleeps(&[], explicit)).await;
     cluster.create("lost", sleeps(&[], topic("/r1/chatter", 1.0, "2s"))).await;
@@ -63,7 +65,7 @@ async fn readiness_follows_a_topics_rate_and_two_probes_share_a_subscription() {
     // Slower than one asks for, and fast enough for the other.
     let _slow = publish(&ros, "2");
     let info = async || ros.output("rosnode", &["info", "/muster_probes_robot"]).await;
-    muster_tests::wait::until("two publishers are connected", || async {
+    wait::until("two publishers are connected", || async {
         let text = info().await;
         if text.matches("direction: inbound").count() == 2 { Ok(()) } else { Err(text) }
     })
@@ -80,7 +82,8 @@ async fn readiness_follows_a_topics_rate_and_two_probes_share_a_subscription() {
 #[tokio::test(flavor = "multi_thread")]
 async fn a_task_whose_own_topic_falls_silent_is_ended_and_started_again() {
     let (ros, cluster) = (Ros::start().await, one_robot().await);
-    let script = "timeout 4 rostopic pub -r 20 /own std_msgs/String 'data: x'; exec sleep 1000";
+    // As long as Python may take to start, and some seconds more.
+    let script = "timeout 15 rostopic pub -r 20 /own std_msgs/String 'data: x'; exec sleep 1000";
     let (master, home) = (ros.master(), ros.dir().display().to_string());
     let env = [
         ("ROS_MASTER_URI", master.as_str()),
@@ -96,9 +99,13 @@ async fn a_task_whose_own_topic_falls_silent_is_ended_and_started_again() {
     spec["liveness"] = topic("/own", 5.0, "1s");
     spec["liveness"]["failureThreshold"] = 2.into();
     cluster.create("talker", spec).await;
-    ready(&cluster, "talker").await;
-    let again = cluster.task("talker", "started again", |s| s.attempt >= 2).await;
-    let events = cluster.get("/api/v1/namespaces/default/events").await.to_string();
-    assert!(events.contains("its liveness probe failed 2 times in a row"), "{events} {again:#?}");
+    let first = ready(&cluster, "talker").await.attempt;
+    cluster.task("talker", "started again", |s| s.attempt > first).await;
+    wait::until("told", || async {
+        let events = cluster.get("/api/v1/namespaces/default/events").await.to_string();
+        let told = events.contains("its liveness probe failed 2 times in a row");
+        if told { Ok(()) } else { Err(events) }
+    })
+    .await;
     ready(&cluster, "talker").await;
 }

@@ -280,4 +280,19 @@ contexts: [{{name: hall, context: {{cluster: hall, user: u, namespace: team}}}}]
             assert!(address(bad).is_err(), "{bad}");
         }
     }
+
+    #[test]
+    fn any_file_is_a_target_or_an_error() {
+        let dir = tempfile::tempdir().expect("a directory");
+        let file = [dir.path().join("config")];
+        bolero::check!()
+            .with_generator(muster_hostile::inputs("kubeconfig"))
+            .with_test_time(muster_hostile::test_time())
+            .for_each(|bytes: &Vec<u8>| {
+                std::fs::write(&file[0], bytes).expect("it is ours");
+                if let Err(error) = load(&file) {
+                    assert!(!error.to_string().is_empty());
+                }
+            });
+    }
 }

@@ -79,7 +79,7 @@ pub fn standing(title: &str, spec: &TaskSpec, stopping: bool) -> Standing {
     Standing {
         priority: spec.priority,
         stopping,
-        executor: executor.map(|e| format!("{}/{}", namespace_of(title), e.task).into()),
+        executor: executor.map(|e| executor_title(title, &e.task).into()),
     }
 }
 
@@ -124,6 +124,9 @@ pub struct Plan {
     pub preemptions: Vec<Preemption>,
     /// What some of those that wait leave to frameworks.
     pub claims: Vec<Claim>,
+    /// What was decided gave something that tasks may have wanted whose turn was before: room that was kept for another, or the
+    /// executor that they are work for. They are to be looked at again.
+    pub again: bool,
 }
 
 /// Most nodes that are named in a task's reasons; the others are counted. A status must not grow
@@ -138,8 +141,8 @@ pub fn schedule(cluster: &mut Cluster, demands: &mut [Demand]) -> Plan {
 /// What of the waiting tasks can be placed now that robots moved, without a word about the others: their reasons name
 /// every node, and robots move many times a second. Nobody is ended for them either. Only tasks that ask for a place gain
 /// by it; the caller gives those.
-pub fn schedule_moved(cluster: &mut Cluster, demands: &mut [Demand]) -> Vec<Bind> {
-    decide(cluster, demands, Depth::Places).binds
+pub fn schedule_moved(cluster: &mut Cluster, demands: &mut [Demand]) -> Plan {
+    decide(cluster, demands, Depth::Places)
 }
 
 /// What is decided of tasks that have no place.
@@ -153,8 +156,10 @@ enum Depth {
 
 fn decide(cluster: &mut Cluster, demands: &mut [Demand], depth: Depth) -> Plan {
     demands.sort_by_key(|d| (std::cmp::Reverse(d.spec.priority), d.since));
-    let mut plan = Plan::default();
-    // A pass only takes, so what had no place for a task has none for one that asks the same.
+    let (mut plan, given_up) = (Plan::default(), cluster.given_up());
+    // Whose executor has no place yet, by its title.
+    let mut idle: BTreeSet<String> = BTreeSet::new();
+    // A pass mostly takes, so what had no place for a task has none for one that asks the same; when it gave, there is another.
     let mut hopeless = Hopeless::default();
     let mut accounts = cluster.accounts().clone();
     let mut turns = Turns::new(demands);
@@ -192,6 +197,7 @@ fn decide(cluster: &mut Cluster, demands: &mut [Demand], depth: Depth) -> Plan {
                 let (namespace, leases) = (namespace_of(&demand.title), bind.leases.len() as u64);
                 accounts.add(namespace, &compute, leases);
                 cluster.serve(namespace, &compute, leases);
+                plan.again |= idle.contains(&*demand.title);
                 plan.binds.push(bind);
             }
             None => {
@@ -201,12 +207,20 @@ fn decide(cluster: &mut Cluster, demands: &mut [Demand], depth: Depth) -> Plan {
                 };
                 let wait = Wait { brief: !claims.is_empty(), ..Wait::new(demand, why) };
                 plan.claims.extend(claims);
+                let executor = demand.spec.run.executor.as_ref();
+                idle.extend(executor.map(|e| executor_title(&demand.title, &e.task)));
                 hopeless.remember(demand, &wait);
                 plan.waits.push(wait);
             }
         }
     }
+    plan.again |= cluster.given_up() != given_up;
     plan
+}
+
+/// The title of the executor that a task of this title is work for.
+fn executor_title(title: &str, executor: &str) -> String {
+    format!("{}/{executor}", namespace_of(title))
 }
 
 /// Whose turn it is, of tasks that are sorted by priority and age.
@@ -315,6 +329,8 @@ fn asks_the_same(a: &Demand, b: &Demand) -> bool {
         && a.avoid == b.avoid
         && one.run.executor.is_none()
         && other.run.executor.is_none()
+        // Nobody ends those that it waits for.
+        && one.depends_on == other.depends_on
         && (one.placement.apart.is_none() || namespace_of(&a.title) == namespace_of(&b.title))
 }
 

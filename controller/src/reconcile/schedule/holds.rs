@@ -4,6 +4,7 @@
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
+use std::time::Duration;
 
 use jiff::Timestamp;
 use muster_api::id::TaskUid;
@@ -17,6 +18,9 @@ use tokio::time::Instant;
 use super::{Scheduler, Waiting};
 use crate::store::Key;
 use crate::{configs, depends};
+
+/// Longest wait for a time of the wall clock.
+const LOOK_AGAIN: Duration = Duration::from_secs(30);
 
 impl Scheduler {
     /// Why a task is not considered for a place, by what the store says now.
@@ -46,8 +50,8 @@ impl Scheduler {
         }
         self.look_again_at(due);
         let (until, _) = self.resting.first()?;
-        // The clock of the machine may have been set back: an early look is a look for nothing.
-        Some(Instant::now() + until.duration_since(now).unsigned_abs())
+        // The clock of the machine may be set: an early look is a look for nothing, and none is late for longer than this.
+        Some(Instant::now() + until.duration_since(now).unsigned_abs().min(LOOK_AGAIN))
     }
 
     /// What waiting tasks name has changed.

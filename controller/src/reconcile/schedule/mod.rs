@@ -30,6 +30,7 @@ use muster_api::name::NodeName;
 use muster_api::phase::TaskPhase;
 use muster_controller_core::cluster::{Cluster, Executor};
 use muster_controller_core::ledger::Reservation;
+use muster_controller_core::offer::COURTESY;
 use muster_controller_core::recent::Recent;
 use muster_controller_core::reschedule;
 use muster_controller_core::schedule::{self, Demand};
@@ -53,6 +54,8 @@ use holds::resting_until;
 /// How often changed numbers in a waiting task's reasons are written. New reasons are written at
 /// once; a reason whose numbers move with every bind would write without end.
 const WHY_EVERY: Duration = Duration::from_secs(1);
+/// Between two decisions of which the first gave something that tasks may have wanted whose turn was before.
+const AGAIN: Duration = Duration::from_millis(100);
 /// Questions that wait; they are answered between passes.
 const QUESTIONS: usize = 1024;
 
@@ -317,6 +320,8 @@ impl Scheduler {
             let Ok(node) = NodeName::new(lease.spec.node.clone()) else { return };
             let status = lease.status.unwrap_or_default();
             self.counter.changed();
+            // A group that is new is not in its Node's books.
+            self.dirty.insert(node.clone());
             self.cluster.set_lease(
                 &node,
                 &lease.spec.group,
@@ -519,13 +524,14 @@ impl Scheduler {
         let mut demands: Vec<Demand> = self.placeable().map(|w| w.demand.clone()).collect();
         let mut plan = schedule::schedule(&mut self.cluster, &mut demands);
         // What fails to be written from here on changes it again.
-        self.decided = Some(self.cluster.edition());
+        self.decided = (!plan.again).then(|| self.cluster.edition());
+        let again = plan.again.then(|| Instant::now() + AGAIN);
         self.desk.claim(&plan.claims);
         plan.waits.extend(self.held());
         let binds = self.bind_all(plan.binds).await;
         let preempted = self.preempt_all(plan.preemptions).await;
         let waits = self.write_reasons(plan.waits).await;
-        soonest([binds, preempted, waits])
+        soonest([again, binds, preempted, waits])
     }
 
     /// Robots moved: offers follow them at the end of the pass, and tasks that ask for a place may have one now. Why the
@@ -541,14 +547,19 @@ impl Scheduler {
         if demands.is_empty() || self.binds_after.is_some_and(|at| at > now) {
             return;
         }
-        let binds = schedule::schedule_moved(&mut self.cluster, &mut demands);
-        let retry = self.bind_all(binds).await;
-        self.look_again = soonest([self.look_again, retry, Some(now + WHY_EVERY)]);
+        let plan = schedule::schedule_moved(&mut self.cluster, &mut demands);
+        // What is left to somebody is left for so long.
+        let soon = if plan.claims.is_empty() { WHY_EVERY } else { COURTESY };
+        let retry = self.bind_all(plan.binds).await;
+        self.look_again = soonest([self.look_again, retry, Some(now + soon)]);
     }
 
     /// Offers and books after what was decided. Says when the desk has something to do even if nothing changes.
     async fn close_pass(&mut self) -> Option<Instant> {
+        let before = self.cluster.edition();
         let desk = self.desk.work(&mut self.cluster).await;
+        // What an Accept gave back, which was not written after all, may be somebody else's.
+        let back = (self.cluster.edition() != before).then(Instant::now);
         if !self.dirty.is_empty() {
             self.counter.changed();
         }
@@ -558,7 +569,7 @@ impl Scheduler {
                 self.books.put(&node, Page::from(&member.ledger));
             }
         }
-        soonest([desk, count])
+        soonest([desk, back, count])
     }
 }
 

@@ -11,6 +11,7 @@ use tokio_util::sync::CancellationToken;
 use super::*;
 use crate::objects::FRAMEWORKS;
 use crate::reconcile::desk::{Depth, Outlet, Request};
+use crate::store::Op;
 
 /// No wait in a test should take this long.
 const DEADLINE: Duration = Duration::from_secs(60);
@@ -86,4 +87,15 @@ async fn nothing_is_decided_again_when_nothing_has_changed() {
     let quota = json!({"metadata": metadata, "spec": {"weight": 2.0}});
     create(&context, Key::namespaced(QUOTAS, "default", QUOTA_NAME), quota).await;
     assert!(quiet(&context, &handle).await > now, "a quota may let it go");
+
+    let now = quiet(&context, &handle).await;
+    let grid = json!({"width": 1, "height": 1, "resolution": 1.0, "origin": {"x": 0.0, "y": 0.0}, "cells": "o"});
+    let lab = Key::cluster(SITES, "lab");
+    let site = json!({"metadata": {"name": "lab"}, "spec": {"inflation": 0.2, "grid": grid}});
+    create(&context, lab.clone(), site).await;
+    let walled = quiet(&context, &handle).await;
+    assert!(walled > now, "a wall may be in the way");
+    let stored = context.store.get(&lab).expect("it is there");
+    context.store.apply_one(Op::remove(lab, stored.revision)).await.expect("it is written");
+    assert!(quiet(&context, &handle).await > walled, "the wall is gone");
 }

@@ -222,6 +222,8 @@ impl Scheduler {
                 Err(error) if objects::is_race(&error) => {}
                 Err(error) => {
                     tracing::warn!(task = %uid, error = crate::app::chain(&error), "a task's reasons are not written");
+                    let at = Instant::now() + RETRY;
+                    later = Some(later.map_or(at, |l: Instant| l.min(at)));
                 }
             }
         }

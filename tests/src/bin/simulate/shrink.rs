@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use crate::run::{self, Outcome, Plan};
 
 /// How long it may take. What is left out first is half of all, so most is gone in the first seconds.
-const AT_MOST: Duration = Duration::from_secs(60);
+const AT_MOST: Duration = Duration::from_secs(180);
 
 /// A shorter run that breaks the same invariant.
 pub(crate) fn shrink(plan: &Plan, outcome: &Outcome) -> Plan {

@@ -1,0 +1,224 @@
+//! What a stranger may send: seeds, which are what friends send, with pieces cut out, doubled, exchanged and made extreme.
+//!
+//! Random bytes do not get past the first line of a parser; a manifest with one value that is too large does. A target is a test:
+//!
+//! ```ignore
+//! #[test]
+//! fn quantities() {
+//!     bolero::check!()
+//!         .with_generator(muster_hostile::inputs("quantities"))
+//!         .with_test_time(muster_hostile::test_time())
+//!         .for_each(|bytes: &Vec<u8>| { … });
+//! }
+//! ```
+//!
+//! Its seeds are the files of `seeds/NAME`, and those that it names beside. `cargo test` gives each a few seconds
+//! ([`test_time`]); bolero shrinks what makes one fail and prints it: it belongs among the seeds then. The same targets
+//! run under bolero's other engines, which are guided by coverage: `cargo bolero test -e libfuzzer …`.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use bolero::{Driver, ValueGenerator};
+
+/// Seconds for each target, when the environment says so.
+pub const SECONDS: &str = "MUSTER_HOSTILE_SECONDS";
+
+/// For each target, seconds.
+const USUAL: u64 = 5;
+
+/// Edits of a seed.
+const EDITS: usize = 6;
+
+/// Longest piece that is cut out, doubled or moved, bytes.
+const PIECE: usize = 64;
+
+/// Longest run of one piece, in times.
+const RUN: usize = 3_000;
+
+/// Inputs are no longer than this, bytes: limits of size have tests of their own.
+const LONGEST: usize = 256 << 10;
+
+/// What readers stumble over.
+const WORDS: [&[u8]; 40] = [
+    b"",
+    b" ",
+    b"\n",
+    b"\t",
+    b"\r\n",
+    b"\0",
+    b"-",
+    b"-1",
+    b"0",
+    b"1e308",
+    b"1e-400",
+    b"NaN",
+    b"inf",
+    b"-0",
+    b"9223372036854775808",
+    b"18446744073709551616",
+    b"0x7f",
+    b"1_000",
+    b"\xff",
+    b"\xc0\x80",
+    b"\xef\xbb\xbf",
+    "\u{202e}".as_bytes(),
+    "é".as_bytes(),
+    b"\"",
+    b"'",
+    b"\\",
+    b"{",
+    b"}",
+    b"[",
+    b"]",
+    b"<",
+    b">",
+    b"&",
+    b"%",
+    b"/",
+    b"..",
+    b"~",
+    b"null",
+    b"\xff\xff\xff\xff",
+    b"\x80\x80\x80\x80\x10",
+];
+
+/// Seeds, and what may come of them.
+#[derive(Debug, Clone)]
+pub struct Inputs(Vec<Vec<u8>>);
+
+/// The seeds of a target: the files of `seeds/NAME` beside this crate.
+///
+/// # Panics
+///
+/// When there are none.
+#[must_use]
+pub fn inputs(name: &str) -> Inputs {
+    Inputs(Vec::new()).and_those_in(&Path::new(env!("CARGO_MANIFEST_DIR")).join("seeds").join(name))
+}
+
+/// How long each target runs.
+///
+/// # Panics
+///
+/// When the environment says something that is no number.
+#[must_use]
+pub fn test_time() -> Duration {
+    let seconds =
+        std::env::var(SECONDS).ok().map(|text| text.parse().expect("a number of seconds"));
+    Duration::from_secs(seconds.unwrap_or(USUAL))
+}
+
+impl Inputs {
+    /// The files of another directory, too.
+    ///
+    /// # Panics
+    ///
+    /// When there are none.
+    #[must_use]
+    pub fn and_those_in(mut self, dir: &Path) -> Inputs {
+        let entries =
+            fs::read_dir(dir).unwrap_or_else(|error| panic!("{}: {error}", dir.display()));
+        let mut files: Vec<PathBuf> =
+            entries.map(|entry| entry.expect("it is listed").path()).collect();
+        // The same choices are the same input on every machine.
+        files.sort();
+        let before = self.0.len();
+        self.0.extend(
+            files
+                .iter()
+                .filter(|file| file.is_file())
+                .map(|file| fs::read(file).expect("it is readable")),
+        );
+        assert!(self.0.len() > before, "{} has no seeds", dir.display());
+        self
+    }
+
+    /// These, too.
+    #[must_use]
+    pub fn and(mut self, seeds: impl IntoIterator<Item = Vec<u8>>) -> Inputs {
+        self.0.extend(seeds);
+        self
+    }
+
+    fn any<D: Driver>(&self, driver: &mut D) -> Option<&[u8]> {
+        let at = (0..self.0.len()).generate(driver)?;
+        Some(&self.0[at])
+    }
+
+    fn edit<D: Driver>(&self, bytes: &mut Vec<u8>, driver: &mut D) -> Option<()> {
+        let at = (0..=bytes.len()).generate(driver)?;
+        let end = (at + (0..=PIECE).generate(driver)?).min(bytes.len());
+        match (0..8_u8).generate(driver)? {
+            0 => drop(bytes.drain(at..end)),
+            1 => bytes.truncate(at),
+            2 => bytes.extend_from_within(at..end),
+            3 => {
+                let times = (1..=RUN).generate(driver)?;
+                let piece = bytes[at..end.min(at + 8)].repeat(times);
+                insert(bytes, at, &piece);
+            }
+            4 => {
+                let word = WORDS[(0..WORDS.len()).generate(driver)?];
+                bytes.splice(at..end, word.iter().copied());
+            }
+            5 => insert(bytes, at, WORDS[(0..WORDS.len()).generate(driver)?]),
+            6 => {
+                let other = self.any(driver)?;
+                let from = (0..=other.len()).generate(driver)?;
+                let to = (from + (0..=PIECE).generate(driver)?).min(other.len());
+                bytes.splice(at..end, other[from..to].iter().copied());
+            }
+            _ => {
+                if let Some(byte) = bytes.get_mut(at) {
+                    *byte = (0..=u8::MAX).generate(driver)?;
+                }
+            }
+        }
+        bytes.truncate(LONGEST);
+        Some(())
+    }
+}
+
+fn insert(bytes: &mut Vec<u8>, at: usize, piece: &[u8]) {
+    bytes.splice(at..at, piece.iter().copied());
+}
+
+impl ValueGenerator for Inputs {
+    type Output = Vec<u8>;
+
+    fn generate<D: Driver>(&self, driver: &mut D) -> Option<Vec<u8>> {
+        let mut bytes = self.any(driver)?.to_vec();
+        // None at all is the seed as it is.
+        for _ in 0..(0..=EDITS).generate(driver)? {
+            self.edit(&mut bytes, driver)?;
+        }
+        Some(bytes)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeSet;
+    use std::sync::Mutex;
+
+    use super::*;
+
+    #[test]
+    fn inputs_are_seeds_and_what_is_near_them() {
+        let seeds = || Inputs(Vec::new()).and([b"cpu: 500m".to_vec(), b"memory: 1Gi".to_vec()]);
+        let made = Mutex::new(BTreeSet::new());
+        bolero::check!().with_generator(seeds()).with_iterations(2_000).for_each(
+            |bytes: &Vec<u8>| {
+                assert!(bytes.len() <= LONGEST);
+                made.lock().unwrap().insert(bytes.clone());
+            },
+        );
+        let made = made.into_inner().unwrap();
+        assert!(seeds().0.iter().all(|seed| made.contains(seed)), "seeds as they are");
+        assert!(made.len() > 1_000, "{}", made.len());
+        let near = |bytes: &&Vec<u8>| bytes.starts_with(b"cpu: ") || bytes.starts_with(b"memory: ");
+        assert!(made.iter().filter(near).count() > made.len() / 4);
+    }
+}
