@@ -282,7 +282,7 @@ contexts: [{{name: hall, context: {{cluster: hall, user: u, namespace: team}}}}]
     }
 
     #[test]
-    fn any_file_is_a_target_or_an_error() {
+    fn hostile_files_are_targets_or_errors() {
         let dir = tempfile::tempdir().expect("a directory");
         let file = [dir.path().join("config")];
         bolero::check!()
