@@ -1,15 +1,12 @@
 //! What a stranger may send: seeds, which are what friends send, with pieces cut out, doubled, exchanged and made extreme.
 //!
-//! Random bytes do not get past the first line of a parser; a manifest with one value that is too large does. A target is a test:
+//! Random bytes do not get past the first line of a parser; a manifest with one value that is too large does. In a test that is a target stands:
 //!
-//! ```ignore
-//! #[test]
-//! fn quantities() {
-//!     bolero::check!()
-//!         .with_generator(muster_hostile::inputs("quantities"))
-//!         .with_test_time(muster_hostile::test_time())
-//!         .for_each(|bytes: &Vec<u8>| { … });
-//! }
+//! ```no_run
+//! bolero::check!()
+//!     .with_generator(muster_hostile::inputs("quantities"))
+//!     .with_test_time(muster_hostile::test_time())
+//!     .for_each(|bytes: &Vec<u8>| assert!(String::from_utf8_lossy(bytes).parse::<u8>().is_err()));
 //! ```
 //!
 //! Its seeds are the files of `seeds/NAME`, and those that it names beside. `cargo test` gives each a few seconds
