@@ -10,6 +10,7 @@
 //!
 //! | module | decides |
 //! |---|---|
+//! | [`access`] | who may do what |
 //! | [`ledger`] | what each node has left, and who holds its actuators (invariants 1 and 2) |
 //! | [`poses`] | where every robot is now, and when that is written down |
 //! | [`space`] | which robots are nearest, without a scan |
@@ -39,6 +40,7 @@
 //! | [`report`] | typed reasons, with the words people read |
 #![deny(missing_docs)]
 
+pub mod access;
 pub mod apply;
 pub mod cluster;
 pub mod config;

@@ -204,6 +204,7 @@ fn resources(of: &ApiGroup) -> Vec<Shown> {
         "authorization.k8s.io" => vec![
             simple("selfsubjectaccessreviews", "SelfSubjectAccessReview", false, &["create"]),
             simple("selfsubjectrulesreviews", "SelfSubjectRulesReview", false, &["create"]),
+            simple("subjectaccessreviews", "SubjectAccessReview", false, &["create"]),
         ],
         metrics_api::GROUP => vec![
             simple("nodes", "NodeMetrics", false, &["get", "list"]),

@@ -29,7 +29,7 @@ struct Request {
 }
 
 pub(super) async fn join(call: Call) -> Answer {
-    let Call { context, request, identity, .. } = call;
+    let Call { context, request, asker, .. } = call;
     let (parts, body) = request.into_parts();
     let body = body::json(&parts.headers, body).await?;
     let asked: Request = serde_json::from_value(body)
@@ -45,7 +45,7 @@ pub(super) async fn join(call: Call) -> Answer {
     let candidate =
         Candidate { node: &asked.node_name, kind: asked.kind, key: key_of(&certificate)? };
     let taken = enrol::check(&context, &candidate)?;
-    let right = right(&context, &asked, &identity, taken).await?;
+    let right = right(&context, &asked, &asker.identity, taken).await?;
     enrol::enrol(&context, &candidate, right).await?;
     // Whoever spoke for the node until now has to show the key that counts.
     if let (Some(live), Ok(name)) = (context.live(), asked.node_name.parse()) {

@@ -32,8 +32,7 @@ use super::nodes::{self, Speaker};
 use super::poses::LivePoses;
 use super::proto::agent_service_server::AgentService;
 use super::strays::lives;
-use super::{Connection, NodeUsage, Sessions, relay, reports};
-use crate::auth::Identity;
+use super::{Connection, NodeUsage, Sessions, agent_of, relay, reports};
 use crate::context::Context;
 use crate::objects;
 use crate::reconcile::images;
@@ -107,7 +106,7 @@ impl AgentService for Agents {
         &self,
         request: Request<Streaming<wire::AgentMessage>>,
     ) -> Result<Response<Self::SessionStream>, Status> {
-        let (node, key) = peer(&request)?;
+        let (node, key) = agent_of(&request)?;
         let outbound = self.begin(node, key, Box::pin(request.into_inner()));
         Ok(Response::new(Box::pin(outbound)))
     }
@@ -116,7 +115,7 @@ impl AgentService for Agents {
         &self,
         request: Request<wire::OrdersRequest>,
     ) -> Result<Response<Self::OrdersStream>, Status> {
-        let (node, key) = peer(&request)?;
+        let (node, key) = agent_of(&request)?;
         // Followed before it is read: what changes in between is told.
         let told = self.sessions.orders().follow(&node);
         let (stored, object) =
@@ -132,7 +131,7 @@ impl AgentService for Agents {
         &self,
         request: Request<Streaming<wire::Message>>,
     ) -> Result<Response<Self::MessagesStream>, Status> {
-        let (node, key) = peer(&request)?;
+        let (node, key) = agent_of(&request)?;
         nodes::admit(&self.context, &node, &key).map_err(|error| status(&error))?;
         let connection = self.sessions.connection(&node);
         let connection = connection.ok_or_else(|| {
@@ -164,16 +163,6 @@ async fn hear_messages(
         if let Some(live) = context.live() {
             live.frameworks.take_from_executor(&node, message);
         }
-    }
-}
-
-/// The node of the client's certificate, and its key.
-fn peer<T>(request: &Request<T>) -> Result<(NodeName, String), Status> {
-    match request.extensions().get::<Identity>() {
-        Some(Identity::Node { name, key }) => NodeName::new(name.clone())
-            .map(|name| (name, key.clone()))
-            .map_err(|e| Status::unauthenticated(format!("the certificate's name {e}"))),
-        _ => Err(Status::unauthenticated("a node's client certificate is needed")),
     }
 }
 

@@ -40,10 +40,15 @@ use std::time::Duration;
 
 use muster_api::name::NodeName;
 use muster_api::wire::agent::v1 as wire;
+use muster_controller_core::access::{Who, decide};
 use muster_controller_core::node_health::{DETECT_AFTER, Monotonic, NodeHealth};
 use tokio::sync::{Notify, RwLock, RwLockReadGuard, RwLockWriteGuard, mpsc, watch};
 use tokio::time::Instant;
 
+use tonic::{Request, Status};
+
+use crate::auth::{self, Identity};
+use crate::rest::failure::Failure;
 use board::Board;
 use orders::Orders;
 
@@ -51,6 +56,27 @@ use orders::Orders;
 #[allow(clippy::all, clippy::allow_attributes, unreachable_pub, reason = "generated")]
 pub(crate) mod proto {
     include!(concat!(env!("OUT_DIR"), "/muster.agent.v1.rs"));
+}
+
+/// The node for which the client's certificate speaks, and its key.
+fn agent_of<T>(request: &Request<T>) -> Result<(NodeName, String), Status> {
+    let Some(Identity::Node { name, key }) = request.extensions().get::<Identity>() else {
+        return Err(Status::unauthenticated("a node's client certificate is needed"));
+    };
+    let who = Who::Node(name.clone());
+    let asked = auth::stream(("nodes", "session"), None, Some(name));
+    decide(&who, &asked).map_err(|denied| Status::permission_denied(denied.to_string()))?;
+    let node = NodeName::new(name.clone())
+        .map_err(|error| Status::unauthenticated(format!("the certificate's name {error}")))?;
+    Ok((node, key.clone()))
+}
+
+/// A refusal of a stream.
+fn status_of(failure: &Failure) -> Status {
+    match failure.code() {
+        401 => Status::unauthenticated(failure.message()),
+        _ => Status::permission_denied(failure.message()),
+    }
 }
 
 /// What tasks and nodes use now, as the last heartbeats said.
