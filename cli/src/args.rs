@@ -96,7 +96,7 @@ pub(crate) enum Command {
     /// Register nodes, and fence those that are lost
     #[command(subcommand)]
     Node(node::Command),
-    /// Tokens with which agents join
+    /// Tokens with which agents join, and tokens of users
     #[command(subcommand)]
     Token(token::Command),
     /// Print the versions of client and controller
@@ -222,6 +222,8 @@ mod tests {
             "muster node unlock r1 --holder ada",
             "muster token create --ttl 2h --node r1 --uses 3",
             "muster token list",
+            "muster token create --user ada --group lab --ttl 8h --as-kubeconfig",
+            "muster token list --users",
             "muster token delete abc",
             "muster completion bash",
             "muster controller --data-dir d --listen 127.0.0.1:0 --kubeconfig k",
@@ -245,6 +247,8 @@ mod tests {
             "muster delete tasks --now --grace-period 3",
             "muster node register r1 --kind plane",
             "muster node fence r1 --yes",
+            "muster token create --user ada --node r1",
+            "muster token create --group lab",
             "muster plan",
             "muster offers deliver -A",
         ] {

@@ -25,6 +25,7 @@ pub(crate) mod simulate;
 pub(crate) mod token;
 pub(crate) mod top;
 mod transaction;
+mod user_token;
 pub(crate) mod version;
 pub(crate) mod wait;
 pub(crate) mod why;

@@ -4,6 +4,8 @@
 //! user may is what Access objects give the user's name and groups; the token itself gives nothing. It ends by itself, or when
 //! it is deleted.
 
+use base64::Engine as _;
+use base64::engine::general_purpose::STANDARD;
 use http::StatusCode;
 use jiff::{SignedDuration, Timestamp};
 use muster_api::kind::access::check_subject_name;
@@ -107,8 +109,8 @@ async fn create(call: Call) -> Answer {
     let (token, stored) = make(&context, new.spec).await?;
     let mut shown = public(&stored).unwrap_or_default();
     shown["status"]["token"] = token.into();
-    // With these three and its address a kubeconfig is whole.
-    shown["status"]["certificateAuthority"] = context.pki.ca().into();
+    // With this and the controller's address a kubeconfig is whole.
+    shown["status"]["certificateAuthorityData"] = STANDARD.encode(context.pki.ca()).into();
     Ok(super::json(StatusCode::CREATED, &shown))
 }
 

@@ -3,6 +3,7 @@
 
 mod access;
 mod agent;
+mod audit;
 mod config;
 mod dependencies;
 mod fencing;
@@ -15,7 +16,9 @@ mod quotas;
 mod radius;
 mod removal;
 mod reschedule;
+mod roles;
 mod support;
+mod tokens;
 mod transaction;
 mod views;
 mod watching;

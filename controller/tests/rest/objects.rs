@@ -298,6 +298,7 @@ async fn discovery_tells_what_there_is() {
     assert_eq!(
         named,
         [
+            "accesses",
             "applications",
             "applications/status",
             "frameworks",
