@@ -259,6 +259,11 @@ fn resource(entry: &Entry) -> Vec<Shown> {
             sub("eviction", Some(("policy", "v1")), "Eviction", &["create"]);
             sub("exec", None, "PodExecOptions", &["create", "get"]);
         }
+        (_, "Lease") => {
+            sub("acquire", None, "LeaseRequest", &["create"]);
+            sub("return", None, "LeaseRequest", &["create"]);
+            sub("take", None, "LeaseRequest", &["create"]);
+        }
         (GROUP, "Node") => sub("fence", None, "NodeFence", &["create"]),
         (_, "TaskSet") => {
             sub("scale", Some(("autoscaling", "v1")), "Scale", &["get", "patch", "update"]);

@@ -22,6 +22,7 @@
 //! | `core_view`, `eviction`, `metrics_api` | what is written through core kinds; `kubectl drain`, `kubectl top` |
 //! | `review` | what a client may do, and who it is |
 //! | `fence` | a person's word that a node is off |
+//! | `lease` | a person's hold on a robot's actuators |
 //! | `offers` | what frameworks are offered, and why they are not |
 //! | `poses` | where robots are now |
 //! | `together` | what objects have wrong only all together |
@@ -45,6 +46,7 @@ pub mod failure;
 mod fence;
 mod form;
 mod join;
+mod lease;
 mod list;
 pub mod log;
 mod metadata;
@@ -256,6 +258,9 @@ async fn objects(call: Call, verb: Verb, object: Object) -> Answer {
     }
     if object.subresource == Some(Subresource::Fence) {
         return fence::fence(call, object).await;
+    }
+    if let Some(Subresource::Lease(step)) = object.subresource {
+        return lease::answer(call, object, step).await;
     }
     if object.subresource == Some(Subresource::Scale) {
         return scale::answer(call, verb, object).await;

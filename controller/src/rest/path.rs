@@ -2,6 +2,7 @@
 
 use http::{Method, Uri};
 pub use muster_controller_core::access::Verb;
+use muster_controller_core::person::Step;
 
 use super::discovery::{self, ApiGroup};
 use super::failure::Failure;
@@ -57,6 +58,8 @@ pub enum Subresource {
     Exec,
     /// `…/attach`
     Attach,
+    /// `…/acquire`, `…/take`, `…/return`
+    Lease(Step),
 }
 
 impl Subresource {
@@ -72,6 +75,9 @@ impl Subresource {
             Self::Eviction => "eviction",
             Self::Exec => "exec",
             Self::Attach => "attach",
+            Self::Lease(Step::Acquire) => "acquire",
+            Self::Lease(Step::Take) => "take",
+            Self::Lease(Step::Return) => "return",
         }
     }
 }
@@ -100,7 +106,8 @@ impl Object {
                 Subresource::Fence
                 | Subresource::Eviction
                 | Subresource::Exec
-                | Subresource::Attach,
+                | Subresource::Attach
+                | Subresource::Lease(_),
             ) => verb == Verb::Create,
             Some(Subresource::Scale) => matches!(verb, Verb::Get | Verb::Update | Verb::Patch),
             Some(Subresource::Status) => {
@@ -328,6 +335,7 @@ fn object(group: &str, parts: &[&str]) -> Option<Object> {
 
 /// The part of an object of this kind that is called so.
 pub(super) fn subresource(entry: &Entry, name: &str) -> Option<Subresource> {
+    let is_lease = entry.info.kind == "Lease";
     let stored_node = entry.resource == NODES && entry.view == View::Stored;
     let there = match name {
         "status" => (Subresource::Status, entry.info.has_status),
@@ -339,6 +347,9 @@ pub(super) fn subresource(entry: &Entry, name: &str) -> Option<Subresource> {
         "exec" => (Subresource::Exec, entry.info.kind == "Pod"),
         "attach" => (Subresource::Attach, entry.info.kind == "Pod"),
         "scale" => (Subresource::Scale, entry.info.kind == "TaskSet"),
+        "acquire" => (Subresource::Lease(Step::Acquire), is_lease),
+        "take" => (Subresource::Lease(Step::Take), is_lease),
+        "return" => (Subresource::Lease(Step::Return), is_lease),
         _ => return None,
     };
     there.1.then_some(there.0)
@@ -437,6 +448,12 @@ mod tests {
                 "create tasks ns=Some(\"a\") name=Some(\"t\") sub=Some(Attach)",
             ),
             ("GET", format!("{g}/namespaces/a/tasks/t/exec"), "404"),
+            (
+                "POST",
+                format!("{g}/leases/n.body/take"),
+                "create leases ns=None name=Some(\"n.body\") sub=Some(Lease(Take))",
+            ),
+            ("POST", format!("{g}/nodes/n/take"), "404"),
             ("GET", "/api/v1/nodes/n/pose".into(), "404"),
             ("GET", "/apis/metrics.k8s.io/v1beta1/things".into(), "404"),
             ("POST", "/openapi/v3".into(), "405"),

@@ -14,6 +14,7 @@ use std::time::Duration;
 
 use futures::{Stream, StreamExt as _, future};
 use muster_api::id::{Incarnation, TaskUid};
+use muster_api::kind::lease::{DEFAULT_GROUP, Lease};
 use muster_api::name::NodeName;
 use muster_api::pose::Pose;
 use muster_api::wire::agent::v1 as wire;
@@ -120,6 +121,10 @@ impl AgentService for Agents {
         let told = self.sessions.orders().follow(&node);
         let (stored, object) =
             nodes::admit(&self.context, &node, &key).map_err(|error| status(&error))?;
+        let lease = self.context.store.get(&objects::lease_key(node.as_str(), DEFAULT_GROUP));
+        if let Some((lease, stored)) = lease.and_then(|s| Some((objects::read::<Lease>(&s)?, s))) {
+            self.sessions.orders().tell_lease(&lease, stored.revision);
+        }
         self.sessions.orders().say(&node, stored.revision, node_order(&object.spec));
         let told = WatchStream::new(told).filter(|told| future::ready(told.revision > 0));
         let told = told.map(|told| Ok(told.order));
@@ -456,6 +461,7 @@ impl Session {
         state: Option<&wire::NodeState>,
     ) -> Result<(), End> {
         let state = state.ok_or_else(|| Status::invalid_argument("hello.state is missing"))?;
+        self.sessions.set_person_epoch(&self.node, state.person_epoch);
         let mut report =
             NodeReport::try_from(state).map_err(|e| Status::invalid_argument(e.to_string()))?;
         // The Node is written for the rest of the report anyway, so what counts is written with it.

@@ -38,6 +38,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
+use muster_api::id::Epoch;
 use muster_api::name::NodeName;
 use muster_api::wire::agent::v1 as wire;
 use muster_controller_core::access::{Who, decide};
@@ -124,6 +125,8 @@ pub struct Sessions {
     health: Mutex<NodeHealth>,
     health_changed: Notify,
     usage: Mutex<UsageTable>,
+    /// The person's grant that counts at each robot's gate; none: no person's does.
+    persons: watch::Sender<HashMap<NodeName, u64>>,
     started: Instant,
 }
 
@@ -137,6 +140,7 @@ impl Default for Sessions {
             health: Mutex::new(NodeHealth::new(DETECT_AFTER)),
             health_changed: Notify::new(),
             usage: Mutex::default(),
+            persons: watch::Sender::default(),
             started: Instant::now(),
         }
     }
@@ -208,6 +212,21 @@ impl Sessions {
 
     pub(crate) fn set_usage(&self, node: &NodeName, usage: NodeUsage) {
         lock(&self.usage).insert(node.clone(), usage);
+    }
+
+    /// What an agent says of its gate.
+    fn set_person_epoch(&self, node: &NodeName, epoch: u64) {
+        self.persons.send_if_modified(|persons| match epoch {
+            0 => persons.remove(node).is_some(),
+            epoch => persons.insert(node.clone(), epoch) != Some(epoch),
+        });
+    }
+
+    /// Returns when the robot's gate counts this grant to a person, so that nobody else drives. Cancel safe.
+    pub(crate) async fn person_counts(&self, node: &NodeName, epoch: Epoch) {
+        let counts = |persons: &HashMap<NodeName, u64>| persons.get(node) == Some(&epoch.0);
+        // Closed: never, this holds its sender.
+        let _ = self.persons.subscribe().wait_for(counts).await;
     }
 
     pub(crate) fn connection(&self, node: &NodeName) -> Option<Connection> {

@@ -8,6 +8,7 @@ mod config;
 mod dependencies;
 mod fencing;
 mod fleet;
+mod frameworks;
 mod limits;
 mod objects;
 mod overload;

@@ -32,6 +32,9 @@ const EVERYWHERE: &str = "
     muster.dev/nodes/fence            -          -       -          C         C         -
     muster.dev/leases                 GLW        GLW     GLW        GLW       GLW       -
     muster.dev/leases/status          G          G       G          G         G         -
+    muster.dev/leases/acquire         -          -       C          C         C         -
+    muster.dev/leases/return          -          -       C          C         C         -
+    muster.dev/leases/take            -          -       -          C         C         -
     muster.dev/sites                  GLW        GLW     GLW        GLWCUPDX  GLWCUPDX  -
     muster.dev/accesses               -          -       -          GLW       GLWCUPDX  -
     v1/pods                           GLW        GLW     GLWCUPDX   GLWCUPDX  GLWCUPDX  -
@@ -73,6 +76,9 @@ const IN_LAB: &str = "
     muster.dev/nodes/fence            -          -       -          -         -
     muster.dev/leases                 GLW        GLW     GLW        GLW       GLW
     muster.dev/leases/status          G          G       G          G         G
+    muster.dev/leases/acquire         -          -       -          -         -
+    muster.dev/leases/return          -          -       -          -         -
+    muster.dev/leases/take            -          -       -          -         -
     muster.dev/sites                  GLW        GLW     GLW        GLW       GLW
     muster.dev/accesses               -          -       -          -         -
     v1/pods                           GLW        GLW     GLWCUPDX   GLWCUPDX  GLWCUPDX
@@ -84,7 +90,7 @@ const IN_LAB: &str = "
     v1/configmaps                     -          GLW     GLWCUPDX   GLWCUPDX  GLWCUPDX
     v1/secrets                        -          -       GLWCUPDX   GLWCUPDX  GLWCUPDX
     v1/services                       GLW        GLW     GLW        GLW       GLW
-    v1/events                         GLW        GLW     GLW        GLW       GLW
+    v1/events                         GLW        GLW     GLW        GLW       GLWCUPDX
     v1/namespaces                     G          G       G          G         G
     v1/namespaces/status              G          G       G          G         G
     v1/nodes                          GLW        GLW     GLW        GLW       GLW

@@ -87,7 +87,8 @@ async fn no_secret_of_a_token_is_in_any_file() {
                 places.push(path);
                 continue;
             }
-            let bytes = std::fs::read(&path).unwrap();
+            // Temporary files come and go.
+            let Ok(bytes) = std::fs::read(&path) else { continue };
             let found = bytes.windows(secret.len()).any(|window| window == secret.as_bytes());
             assert!(!found, "{}", path.display());
             looked_at += 1;

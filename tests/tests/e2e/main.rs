@@ -15,6 +15,7 @@ mod lease;
 mod lines;
 mod messages;
 mod missions;
+mod person;
 mod poses;
 mod preemption;
 mod probes;

@@ -112,6 +112,13 @@ pub(super) fn of_kind(entry: &Entry, one: &str, paths: &mut Map<String, Value>) 
             sub("fence", vec![Operation::post("A person confirms that it is off.", word)]);
             sub("pose", vec![Operation::get("Where it is now.")]);
         }
+        ("Lease", _) => {
+            let why = || object(&[("reason", text())]);
+            let post = |said| vec![Operation::post(said, why())];
+            sub("acquire", post("A person holds it, if nobody does."));
+            sub("take", post("A person holds it, whoever did."));
+            sub("return", post("The person gives it back."));
+        }
         ("TaskSet", _) => {
             let replicas = object(&[("replicas", json!({"type": "integer"}))]);
             let scale = object(&[
