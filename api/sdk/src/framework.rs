@@ -129,7 +129,7 @@ impl Builder {
         let state = StateFile::new(self.state_file);
         let subscribe = proto::Subscribe {
             name: self.name,
-            namespace: self.namespace.or(target.namespace.clone()).unwrap_or_default(),
+            namespace: self.namespace.or_else(|| target.namespace.clone()).unwrap_or_default(),
             framework_id: state.read().await?.unwrap_or_default(),
             position: position.map(|position| position.0),
             filter: self.filter.map(|filter| filter.0),

@@ -54,7 +54,7 @@ struct Guest {
 struct Pending {
     uid: FrameworkUid,
     session: u64,
-    by: Identity,
+    by: Arc<Identity>,
     call: String,
     launches: Vec<Prepared>,
     guard: Option<Op>,

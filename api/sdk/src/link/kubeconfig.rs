@@ -57,10 +57,13 @@ pub(crate) struct Target {
     pub(crate) namespace: Option<String>,
     ca: Vec<u8>,
     /// Certificate and key; none: the token says who asks.
-    pair: Option<(Vec<u8>, Vec<u8>)>,
+    pair: Option<Pair>,
     /// What is sent with each call; it counts before a certificate.
     pub(crate) authorization: Option<Authorization>,
 }
+
+/// A certificate and its key, PEM.
+type Pair = (Vec<u8>, Vec<u8>);
 
 /// `Bearer TOKEN`, and no log shows it.
 pub(crate) type Authorization = MetadataValue<Ascii>;
@@ -245,7 +248,7 @@ fn authorization(token: &str) -> Result<Authorization, KubeconfigError> {
 }
 
 /// Certificate and key. Who has a token needs none.
-fn pair(user: User) -> Result<Option<(Vec<u8>, Vec<u8>)>, KubeconfigError> {
+fn pair(user: User) -> Result<Option<Pair>, KubeconfigError> {
     let none = user.client_certificate_data.is_none() && user.client_certificate.is_none();
     if none && user.token.is_some() {
         return Ok(None);

@@ -146,7 +146,7 @@ fn rights_add_up_by_name_and_by_group() {
         everybody.clone(),
     ];
     assert_eq!(grants.held_by("ada", &[]), ada);
-    assert_eq!(grants.held_by("bob", &[]), [everybody.clone()]);
+    assert_eq!(grants.held_by("bob", &[]), std::slice::from_ref(&everybody));
     let shift = ["shift".to_owned()];
     assert_eq!(grants.held_by("bob", &shift), [grant(Role::Operator, None), everybody]);
 }

@@ -136,7 +136,7 @@ pub enum Request {
         /// The session's number: what comes of it is that session's.
         session: u64,
         /// Who opened the session.
-        by: Identity,
+        by: Arc<Identity>,
         /// The call's own id, for the Answer.
         call: String,
         /// Which offers it answers.

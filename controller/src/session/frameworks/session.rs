@@ -70,7 +70,7 @@ struct Closed;
 struct Session {
     frameworks: Arc<Frameworks>,
     /// Who opened it.
-    by: Identity,
+    by: Arc<Identity>,
     guest: Guest,
     number: u64,
     out: mpsc::Sender<wire::Event>,
@@ -115,14 +115,14 @@ async fn serve(frameworks: Arc<Frameworks>, wire: Wire, guest: Guest) {
         out: wire.out,
         mailbox: Arc::clone(&mailbox),
         unacknowledged: BTreeMap::new(),
-        by: wire.asker.identity,
+        by: Arc::new(wire.asker.identity),
         guest,
     };
     let (uid, key) = (Arc::clone(&session.guest.uid), session.guest.key.clone());
     tracing::info!(framework = %key, id = %uid, returned = session.guest.returned, "framework subscribed");
     let calls = wire.keep_calls.unwrap_or_else(|| mpsc::channel(1).0);
     let direct = session.guest.direct;
-    let by = session.by.clone();
+    let by = Arc::clone(&session.by);
     let open = Open { outlet: outlet.clone(), by, direct, mailbox, calls, cut: cut.clone() };
     frameworks.connect(&uid, &session_id, open);
     // After it is taken in: whoever writes that it is away looks first whether it is.
@@ -329,7 +329,7 @@ impl Session {
     fn still_may(&self) -> bool {
         let key = &self.guest.key;
         let asked = session_in(key.namespace(), Some(&key.name));
-        Asker::with(&self.frameworks.context, self.by.clone()).may(&asked)
+        Asker::with(&self.frameworks.context, Identity::clone(&self.by)).may(&asked)
     }
 
     fn is_audited(&self) -> bool {
@@ -392,7 +392,7 @@ impl Session {
             return self.answer(id, Some(invalid("accept.refuseSeconds", "is not a time"))).await;
         };
         let offers = accept.offers.iter().filter_map(|id| launch::parse(id)).collect();
-        let (uid, session, by) = (Arc::clone(&self.guest.uid), self.number, self.by.clone());
+        let (uid, session, by) = (Arc::clone(&self.guest.uid), self.number, Arc::clone(&self.by));
         self.ask(Request::Accept { uid, session, by, call: id, offers, launches, refuse, guard })
             .await
     }
