@@ -105,6 +105,7 @@ impl Entry {
     /// What the answer says of the object.
     async fn read(&self, line: &mut Line, response: Response) -> Response {
         line.code = Some(response.status().as_u16());
+        line.objects.extend(response.extensions().get::<Named>().cloned());
         let json = response.headers().get(header::CONTENT_TYPE);
         let json = json.is_some_and(|media| media.as_bytes().starts_with(b"application/json"));
         if !json || response.status() == StatusCode::SWITCHING_PROTOCOLS {
@@ -186,14 +187,12 @@ impl Told {
         line.name = line.name.take().or(name);
         line.namespace = line.namespace.take().or(namespace);
         let objects = self.items.into_iter().chain(self.objects);
-        line.objects = objects
-            .map(|told| Named {
-                kind: told.kind,
-                namespace: told.metadata.namespace,
-                name: told.metadata.name,
-                uid: told.metadata.uid,
-            })
-            .collect();
+        line.objects.extend(objects.map(|told| Named {
+            kind: told.kind,
+            namespace: told.metadata.namespace,
+            name: told.metadata.name,
+            uid: told.metadata.uid,
+        }));
         if !self.refusals.is_empty() {
             line.reason = Some("Refused".to_owned());
         }

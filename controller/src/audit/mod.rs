@@ -67,7 +67,7 @@ pub(crate) struct Line {
     pub(crate) name: Option<String>,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) uid: Option<String>,
-    /// The objects of a write of several.
+    /// The objects of a write of several; whom a token is for, who joined, from whom a lease was taken.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub(crate) objects: Vec<Named>,
     /// HTTP status; none: the client left before the answer, and it may have been carried out.
@@ -97,7 +97,7 @@ impl Line {
     }
 }
 
-/// One of several objects.
+/// One of several objects. In the extensions of an answer: one that the answer itself does not name.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "camelCase")]
 pub(crate) struct Named {

@@ -13,6 +13,7 @@ use serde_json::json;
 use super::enrol::{self, Candidate, Right};
 use super::failure::Failure;
 use super::{Answer, Call, body, token};
+use crate::audit::Named;
 use crate::auth::Identity;
 use crate::context::Context;
 
@@ -52,13 +53,14 @@ pub(super) async fn join(call: Call) -> Answer {
         live.sessions.kick(&name);
     }
     tracing::info!(node = asked.node_name, kind = ?asked.kind, ?right, "joined");
-    Ok(super::json(
-        StatusCode::OK,
-        &json!({
-            "certificate": certificate,
-            "ca": context.pki.ca(),
-        }),
-    ))
+    let answer = json!({ "certificate": certificate, "ca": context.pki.ca() });
+    let mut response = super::json(StatusCode::OK, &answer);
+    response.extensions_mut().insert(Named {
+        kind: Some("Node".to_owned()),
+        name: Some(asked.node_name),
+        ..Named::default()
+    });
+    Ok(response)
 }
 
 async fn right(

@@ -25,6 +25,7 @@ use serde_json::Value;
 
 use super::path::Object;
 use super::{Answer, Call, body, failure::Failure};
+use crate::audit::Named;
 use crate::context::{Context, Live};
 use crate::objects::{self, NODES, TASKS};
 use crate::store::{Key, Op, Precondition, Stored};
@@ -74,7 +75,16 @@ pub(super) async fn answer(call: Call, target: Object, step: Step) -> Answer {
     if step == Step::Take && done.lease.spec.group == DEFAULT_GROUP {
         wait_for_gate(&context, live, &target, &done).await?;
     }
-    Ok(super::raw(StatusCode::OK, done.stored.bytes.clone()))
+    let mut response = super::raw(StatusCode::OK, done.stored.bytes.clone());
+    if let Some(from) = done.from {
+        response.extensions_mut().insert(Named {
+            kind: Some(format!("{:?}", from.kind)),
+            namespace: Some(from.namespace).filter(|namespace| !namespace.is_empty()),
+            name: Some(from.name),
+            uid: Some(from.uid.to_string()),
+        });
+    }
+    Ok(response)
 }
 
 async fn carry_out(

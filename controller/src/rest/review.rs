@@ -9,6 +9,7 @@ use serde::Deserialize as _;
 use serde_json::{Value, json};
 
 use super::path::Object;
+use super::registry::Entry;
 use super::{Answer, Call, body, failure::Failure, path, registry};
 use crate::auth::{self, Asker, Identity};
 
@@ -233,8 +234,9 @@ fn told_rules(asker: &Asker, namespace: &str) -> Value {
 
 /// The groups that have a resource.
 fn groups_of(resource: &str) -> Vec<&'static str> {
-    let plural = resource.split('/').next().unwrap_or_default();
-    let entries = registry::all().iter().filter(|entry| entry.info.plural == plural);
+    let (plural, part) = resource.split_once('/').unwrap_or((resource, ""));
+    let has = |entry: &&Entry| part.is_empty() || path::subresource(entry, part).is_some();
+    let entries = registry::all().iter().filter(|entry| entry.info.plural == plural).filter(has);
     let groups: Vec<&str> = entries.map(|entry| entry.info.group).collect();
     if groups.is_empty() { vec![muster_api::GROUP] } else { groups }
 }

@@ -18,6 +18,7 @@ use super::failure::Failure;
 use super::path::Verb;
 use super::token::{Metadata, hash, random};
 use super::{Answer, Call, body};
+use crate::audit::Named;
 use crate::auth::Identity;
 use crate::context::Context;
 use crate::pki::hex;
@@ -106,12 +107,19 @@ async fn create(call: Call) -> Answer {
     let Call { context, request, .. } = call;
     let (parts, body) = request.into_parts();
     let new: NewToken = body::typed("UserToken", body::json(&parts.headers, body).await?)?;
+    let user = Named {
+        kind: Some("User".to_owned()),
+        name: Some(new.spec.user.clone()),
+        ..Named::default()
+    };
     let (token, stored) = make(&context, new.spec).await?;
     let mut shown = public(&stored).unwrap_or_default();
     shown["status"]["token"] = token.into();
     // With this and the controller's address a kubeconfig is whole.
     shown["status"]["certificateAuthorityData"] = STANDARD.encode(context.pki.ca()).into();
-    Ok(super::json(StatusCode::CREATED, &shown))
+    let mut response = super::json(StatusCode::CREATED, &shown);
+    response.extensions_mut().insert(user);
+    Ok(response)
 }
 
 async fn make(

@@ -82,6 +82,7 @@ async fn each_write_has_a_line_and_no_read_has_one() {
     assert_eq!(lines[0]["uid"], made["metadata"]["uid"]);
     assert_eq!((&lines[1]["uid"], &lines[3]["uid"]), (&lines[4]["uid"], &lines[4]["uid"]));
     assert_eq!((&lines[7]["token"], &lines[7]["groups"][0]), (&token.into(), &"lab".into()));
+    assert_eq!(lines[6]["objects"], json!([{"kind": "User", "name": "ada"}]));
     assert_eq!(lines[8]["objects"][0]["name"], "together");
     assert!(lines[0]["from"].as_str().unwrap().starts_with("127.0.0.1:"));
     let text = std::fs::read_to_string(file(&cluster)).unwrap();

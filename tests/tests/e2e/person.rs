@@ -71,5 +71,5 @@ async fn who_takes_a_robot_has_it_before_the_answer() {
     let text = std::fs::read_to_string(&log).expect("the audit log");
     let line = text.lines().find(|line| line.contains("\"subresource\":\"take\"")).expect("a line");
     assert!(line.contains("\"user\":\"admin\"") && line.contains("\"code\":200"), "{line}");
-    assert!(line.contains("\"name\":\"robot.body\""), "{line}");
+    assert!(line.contains("\"name\":\"robot.body\"") && line.contains("\"first\""), "{line}");
 }
