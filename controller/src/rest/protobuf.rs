@@ -249,8 +249,9 @@ pub(super) fn json(bytes: &[u8]) -> Result<Value, Failure> {
             json!({"metadata": metadata(o.metadata), "deleteOptions": options})
         }),
         "SelfSubjectAccessReview" | "SubjectAccessReview" => AccessReview::decode(raw).map(review),
-        "SelfSubjectRulesReview" => RulesReview::decode(raw)
-            .map(|review| json!({"spec": {"namespace": review.spec.unwrap_or_default().namespace}})),
+        "SelfSubjectRulesReview" => RulesReview::decode(raw).map(
+            |review| json!({"spec": {"namespace": review.spec.unwrap_or_default().namespace}}),
+        ),
         // Of this nothing is read.
         "SelfSubjectReview" => Ok(json!({})),
         other => {
@@ -422,7 +423,8 @@ fn review(review: AccessReview) -> Value {
                "resource": r.resource, "subresource": r.subresource, "name": r.name})
     });
     let other = spec.other.map(|o| json!({"path": o.path, "verb": o.verb}));
-    let mut review = json!({"spec": {"resourceAttributes": resource, "nonResourceAttributes": other}});
+    let mut review =
+        json!({"spec": {"resourceAttributes": resource, "nonResourceAttributes": other}});
     if !spec.user.is_empty() || !spec.groups.is_empty() {
         review["spec"]["user"] = spec.user.into();
         review["spec"]["groups"] = spec.groups.into();
@@ -491,8 +493,9 @@ mod tests {
         );
         let resource =
             ResourceAttributes { verb: "create".into(), ..ResourceAttributes::default() };
-        let review =
-            AccessReview { spec: Some(AccessSpec { resource: Some(resource), ..AccessSpec::default() }) };
+        let review = AccessReview {
+            spec: Some(AccessSpec { resource: Some(resource), ..AccessSpec::default() }),
+        };
         let read =
             json(&sent("authorization.k8s.io/v1", "SelfSubjectAccessReview", &review)).unwrap();
         assert_eq!(read["spec"]["resourceAttributes"]["verb"], "create");
