@@ -172,6 +172,8 @@ impl Node {
         };
         let mut state = proto::NodeState::from(&report);
         state.boot_id.clone_from(&self.boot_id);
+        let gate = self.shared.gate.as_ref();
+        state.person_epoch = gate.map_or(0, |gate| gate.standing().borrow().person_epoch());
         state
     }
 

@@ -4,7 +4,7 @@
 //!
 //! | module | holds |
 //! |---|---|
-//! | [`kind`] | the resources (Node, Task, TaskSet, Application, Lease, Framework, Quota, Site, Namespace, Event): spec, status, admission |
+//! | [`kind`] | the resources (Node, Task, TaskSet, Application, Lease, Framework, Quota, Site, Access, Namespace, Event): spec, status, admission |
 //! | [`manifest`] | YAML or JSON text → objects whose every field knows its file, line and column |
 //! | [`validate`] | violations (path, reason, suggestion) and the walk over a kind's schema |
 //! | [`selector`] | label and field selectors, both forms and their string grammar |

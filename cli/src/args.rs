@@ -9,8 +9,8 @@ use muster_api::selector::{FieldSelector, LabelSelector, SelectorError};
 
 use crate::client::Selection;
 use crate::command::{
-    apply, cordon, create, delete, describe, drain, estop, exec, get, local, logs, node, offers,
-    plan, rollout, scale, token, top, version, wait, why,
+    apply, cordon, create, delete, describe, drain, estop, exec, get, lease, local, logs, node,
+    offers, plan, rollout, scale, token, top, version, wait, why,
 };
 use crate::output::ui::Color;
 
@@ -96,7 +96,10 @@ pub(crate) enum Command {
     /// Register nodes, and fence those that are lost
     #[command(subcommand)]
     Node(node::Command),
-    /// Tokens with which agents join
+    /// Hold a robot's actuators yourself, instead of a task
+    #[command(subcommand)]
+    Lease(lease::Command),
+    /// Tokens with which agents join, and tokens of users
     #[command(subcommand)]
     Token(token::Command),
     /// Print the versions of client and controller
@@ -221,7 +224,12 @@ mod tests {
             "muster node lock r1 --holder ada --reason tray",
             "muster node unlock r1 --holder ada",
             "muster token create --ttl 2h --node r1 --uses 3",
+            "muster lease take r1 --reason stuck",
+            "muster lease acquire r1/arm",
+            "muster lease return r1",
             "muster token list",
+            "muster token create --user ada --group lab --ttl 8h --as-kubeconfig",
+            "muster token list --users",
             "muster token delete abc",
             "muster completion bash",
             "muster controller --data-dir d --listen 127.0.0.1:0 --kubeconfig k",
@@ -245,6 +253,8 @@ mod tests {
             "muster delete tasks --now --grace-period 3",
             "muster node register r1 --kind plane",
             "muster node fence r1 --yes",
+            "muster token create --user ada --node r1",
+            "muster token create --group lab",
             "muster plan",
             "muster offers deliver -A",
         ] {

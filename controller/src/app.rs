@@ -17,6 +17,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use axum::Router;
+use axum::middleware::from_fn_with_state;
 use axum::response::{IntoResponse as _, Response};
 use futures::FutureExt as _;
 use tokio::net::TcpListener;
@@ -44,7 +45,7 @@ use crate::session::poses::{self, LivePoses};
 use crate::session::proto::exec_service_server::ExecServiceServer;
 use crate::session::{self, Sessions};
 use crate::store::{self, OpenError, StoreError};
-use crate::{footprint, kubeconfig, metrics, reconcile, rest};
+use crate::{auth, footprint, kubeconfig, metrics, reconcile, rest};
 
 /// How long requests in flight may take to finish after a signal.
 const DEADLINE: Duration = Duration::from_secs(5);
@@ -207,7 +208,7 @@ pub fn work(
         poses: Arc::clone(&poses),
     });
     let publishers =
-        poses::Service::new(Arc::clone(&poses), background.clone(), context.stop.clone());
+        poses::Service::new(Arc::clone(context), Arc::clone(&poses), background.clone());
     (Agents::new(Arc::clone(context), sessions, poses, background.clone()), publishers)
 }
 
@@ -260,6 +261,7 @@ fn router(context: &Arc<Context>, (agents, publishers): (Agents, poses::Service)
         .merge(frameworks.unwrap_or_default())
         .merge(execs.unwrap_or_default())
         .merge(rest::router(Arc::clone(context)))
+        .layer(from_fn_with_state(Arc::clone(context), auth::by_token))
         .layer(CatchPanicLayer::custom(fault))
 }
 

@@ -8,6 +8,8 @@ use jiff::Timestamp;
 use metrics_exporter_prometheus::PrometheusHandle;
 use tokio_util::sync::CancellationToken;
 
+use crate::audit::Audit;
+use crate::auth::Rights;
 use crate::config::Config;
 use crate::events::Recorder;
 use crate::pki::Pki;
@@ -66,6 +68,10 @@ pub struct Context {
     pub streams: Streams,
     /// Changes as they were last shown to watchers.
     pub rendered: Rendered,
+    /// Who changed what.
+    pub audit: Audit,
+    /// What Access objects give, read.
+    pub(crate) rights: Rights,
     /// Cancelled when a part of the controller has failed for good: the process is to end, and to be started again.
     pub(crate) broken: CancellationToken,
     /// Held while a task is given to a node (shared) and while a Node is deleted (alone): a Node is found unused and is
@@ -105,6 +111,8 @@ impl Context {
         events: Recorder,
     ) -> Self {
         Self {
+            audit: Audit::in_dir(config.data_dir.join("audit")),
+            rights: Rights::default(),
             store,
             clock: Arc::new(SystemClock),
             pki,

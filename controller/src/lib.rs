@@ -10,13 +10,14 @@
 //! | [`rest`] | Kubernetes API conventions over the store |
 //! | [`session`] | agents: who is connected, what each should run, what each says |
 //! | [`reconcile`] | level-triggered loops: scheduling, health, deletion, garbage |
-//! | [`pki`], [`auth`] | certificates; who asks and whether they may |
+//! | [`pki`], [`auth`], [`audit`] | certificates; who asks and whether they may; who changed what |
 //! | [`events`], [`objects`] | Event objects; typed reading and writing of the kinds |
 //! | `quota` | the door of namespaces with a Quota |
 //! | `serve` | the TLS port |
 //! | `kubeconfig`, `metrics`, `footprint` | the admin's credential file; the Prometheus recorder; freed memory and descriptors |
 
 pub mod app;
+pub mod audit;
 pub mod auth;
 pub mod config;
 pub mod configs;

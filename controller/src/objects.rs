@@ -29,6 +29,8 @@ pub const APPLICATIONS: Resource = Resource::new("applications");
 pub const FRAMEWORKS: Resource = Resource::new("frameworks");
 /// Quotas.
 pub const QUOTAS: Resource = Resource::new("quotas");
+/// Who may do what.
+pub const ACCESSES: Resource = Resource::new("accesses");
 /// Sites.
 pub const SITES: Resource = Resource::new("sites");
 /// Leases.

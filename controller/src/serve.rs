@@ -1,7 +1,8 @@
 //! The one port: TLS, then HTTP/1.1 or HTTP/2, then one router for REST and gRPC.
 
+use std::net::SocketAddr;
 use std::pin::pin;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use axum::Router;
@@ -62,13 +63,28 @@ const WINDOW_OF_STRANGERS: u32 = 64 << 10;
 #[derive(Debug)]
 pub(crate) struct Limits {
     handshakes: Arc<Semaphore>,
-    strangers: Semaphore,
+    strangers: Arc<Semaphore>,
 }
 
 impl Default for Limits {
     fn default() -> Self {
         let handshakes = Arc::new(Semaphore::new(HANDSHAKES));
-        Self { handshakes, strangers: Semaphore::new(STRANGERS) }
+        Self { handshakes, strangers: Arc::new(Semaphore::new(STRANGERS)) }
+    }
+}
+
+/// The other end of a connection, in the extensions of its requests.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Peer(pub(crate) SocketAddr);
+
+/// The place among strangers of a connection without a certificate, in the extensions of its requests.
+#[derive(Debug, Clone)]
+pub(crate) struct Stranger(Arc<Mutex<Option<OwnedSemaphorePermit>>>);
+
+impl Stranger {
+    /// A request said who they are, by a token: who floods us with connections of strangers keeps no users out.
+    pub(crate) fn is_known(&self) {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner).take();
     }
 }
 
@@ -127,6 +143,7 @@ impl Server {
     ) -> Result<(), Box<dyn std::error::Error + Send + Sync>> {
         let Self { tls, router, stop, kill, limits, .. } = self;
         watch_over(&stream)?;
+        let peer = Peer(stream.peer_addr()?);
         let handshake = TlsAcceptor::from(tls).accept(stream);
         let stream = tokio::select! {
             () = stop.cancelled() => return Ok(()),
@@ -136,13 +153,21 @@ impl Server {
         let identity = Identity::of(certificates.and_then(|chain| chain.first()));
         drop(shaking);
         let known = identity != Identity::Anonymous;
-        let _place = match known {
+        let stranger = match known {
             true => None,
-            false => Some(limits.strangers.try_acquire()?),
+            false => {
+                let place = Arc::clone(&limits.strangers).try_acquire_owned()?;
+                Some(Stranger(Arc::new(Mutex::new(Some(place)))))
+            }
         };
         let service = hyper::service::service_fn(move |request: Request<Incoming>| {
             let mut request = request.map(Body::new);
-            request.extensions_mut().insert(identity.clone());
+            let extensions = request.extensions_mut();
+            extensions.insert(identity.clone());
+            extensions.insert(peer);
+            if let Some(stranger) = &stranger {
+                extensions.insert(stranger.clone());
+            }
             router.clone().oneshot(request)
         });
         let _counted = Counted::begin();

@@ -33,6 +33,9 @@ const SAY_EVERY: Duration = Duration::from_secs(1);
 /// An agent that goes down in order is back within this, or the robot is stopped: the time of an upgrade.
 const LEAVES_FOR: Duration = Duration::from_secs(10);
 
+/// Who holds the robot when a person does: no task has such a uid.
+const PERSON: &str = "person";
+
 /// How a gate is set up, in short.
 pub(super) fn digest(settings: &Settings) -> String {
     let text = serde_json::to_vec(settings).unwrap_or_default();
@@ -55,6 +58,10 @@ struct Wanted {
     /// None: not heard yet.
     estop: Option<u32>,
     release: u64,
+    /// The newest grant to a person: those of tasks count after it.
+    fence: u64,
+    /// The person holds it still.
+    held: bool,
     leaves: bool,
 }
 
@@ -65,11 +72,15 @@ impl Wanted {
             token: seat.token.clone(),
         };
         // Two tasks have a lease while one of them ends. The newer grant counts.
-        let granted = self.seats.iter().filter_map(|(task, seat)| Some((seat.epoch?, task))).max();
+        let granted = self.seats.iter().filter_map(|(task, seat)| Some((seat.epoch?, task)));
+        let granted = granted.filter(|(epoch, _)| *epoch > self.fence).max();
+        let person = || self.held.then(|| proto::Holder { task: PERSON.into(), epoch: self.fence });
         proto::Wanted {
             id: self.id,
             seats: self.seats.iter().map(seat).collect(),
-            grant: granted.map(|(epoch, task)| proto::Holder { task: task.to_string(), epoch }),
+            grant: granted
+                .map(|(epoch, task)| proto::Holder { task: task.to_string(), epoch })
+                .or_else(person),
             estop: self.estop,
             release: self.release,
             leaves_for_ms: if self.leaves {
@@ -118,6 +129,12 @@ impl Standing {
     /// The task whose right to drive is given back.
     pub(crate) fn gives_back(&self) -> Option<TaskUid> {
         self.status.as_ref()?.gives_back.as_ref().map(|holder| TaskUid::new(holder.task.clone()))
+    }
+
+    /// The person's grant that counts, so that nobody else drives; 0: none.
+    pub(crate) fn person_epoch(&self) -> u64 {
+        let holder = self.status.as_ref().and_then(|status| status.holder.as_ref());
+        holder.filter(|holder| holder.task == PERSON).map_or(0, |holder| holder.epoch)
     }
 
     /// What stops the robot.
@@ -191,6 +208,17 @@ impl Keeper {
             let before = (wanted.estop, wanted.release);
             (wanted.estop, wanted.release) = (Some(estop), release.max(wanted.release));
             before != (wanted.estop, wanted.release)
+        });
+    }
+
+    /// A person was granted the actuators with this number, and holds them still or has returned them. Numbers only grow.
+    pub(crate) fn person(&self, fence: u64, held: bool) {
+        self.change(|wanted| {
+            let before = (wanted.fence, wanted.held);
+            if fence >= wanted.fence {
+                (wanted.fence, wanted.held) = (fence, held && fence > 0);
+            }
+            before != (wanted.fence, wanted.held)
         });
     }
 
@@ -306,5 +334,28 @@ fn end(gate: Option<i32>) {
     if let Some(pid) = gate.and_then(rustix::process::Pid::from_raw) {
         // Gone already: that is what was wanted.
         let _ = rustix::process::kill_process(pid, rustix::process::Signal::TERM);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn granted(wanted: &Wanted) -> Option<(String, u64)> {
+        wanted.message().grant.map(|holder| (holder.task, holder.epoch))
+    }
+
+    #[test]
+    fn what_was_granted_before_a_person_counts_no_more() {
+        let mut wanted = Wanted::default();
+        let seat = |epoch| Seat { token: String::new(), epoch: Some(epoch) };
+        wanted.seats.insert(TaskUid::new("a"), seat(4));
+        assert_eq!(granted(&wanted), Some(("a".to_owned(), 4)));
+        (wanted.fence, wanted.held) = (5, true);
+        assert_eq!(granted(&wanted), Some((PERSON.to_owned(), 5)));
+        wanted.held = false;
+        assert_eq!(granted(&wanted), None, "it is nobody's: the task does not get it back");
+        wanted.seats.insert(TaskUid::new("b"), seat(6));
+        assert_eq!(granted(&wanted), Some(("b".to_owned(), 6)));
     }
 }

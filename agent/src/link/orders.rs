@@ -1,4 +1,4 @@
-//! Emergency stops from the controller, on a connection of their own: nothing that the agent says, and nothing else that it is
+//! Emergency stops from the controller, and whether a person holds the robot, on a connection of their own: nothing that the agent says, and nothing else that it is
 //! told, is ever before them.
 
 use std::convert::Infallible;
@@ -50,6 +50,7 @@ impl Orders {
         let mut orders = begun.into_inner();
         while let Some(order) = orders.message().await.map_err(Box::new)? {
             self.gate.demand(order.estop_tier, order.estop_release);
+            self.gate.person(order.lease_fence, order.lease_held);
             self.heard.send_replace(true);
         }
         Err(StreamError::Closed)

@@ -334,7 +334,7 @@ impl Controller {
 
     /// What a person decides about the node.
     pub fn order_estop(&self, estop_tier: u32, estop_release: u64) {
-        let order = proto::NodeOrder { estop_tier, estop_release };
+        let order = proto::NodeOrder { estop_tier, estop_release, ..proto::NodeOrder::default() };
         self.seen(|seen| seen.order.send_replace(order));
     }
 

@@ -55,6 +55,12 @@ def test_a_kubeconfig_gives_address_and_credentials(tmp_path):
     assert "key'" not in repr(target), "keys do not get into logs"
 
 
+def test_a_token_stands_for_a_certificate(tmp_path):
+    target = kubeconfig.load(written(tmp_path / "config", a_config(token="musteru1.ab.cd")), {})
+    assert (target.token, target.client_certificate, target.client_key) == ("musteru1.ab.cd", None, None)
+    assert "musteru1" not in repr(target), "tokens do not get into logs"
+
+
 def test_credentials_may_be_files_beside_the_kubeconfig(tmp_path):
     (tmp_path / "k.pem").write_text("key of a file")
     config = a_config(**{"client-certificate-data": encoded("cert"), "client-key": "k.pem"})
@@ -76,7 +82,7 @@ def test_argument_then_muster_config_then_kubeconfig(tmp_path):
     [
         (a_config("http://h:1"), "https://host:port"),
         (a_config("https://h:x"), "https://host:port"),
-        (a_config(token="t"), "token is not enough"),
+        (a_config(tokenFile="t"), "tokenFile is not enough"),
         (a_config(**{"client-certificate-data": "!", "client-key-data": "a"}), "not base64"),
         ({**a_config(), "current-context": "home"}, "'home'"),
         ({**a_config(), "users": []}, "'u'"),

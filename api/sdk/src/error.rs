@@ -118,7 +118,7 @@ impl From<proto::Refusal> for CallRefused {
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{reason}: {message}")]
 pub struct FrameworkError {
-    /// One word: `AlreadyExists`, `UnknownFramework`, `Invalid`, `Cut`, or the name of a gRPC code.
+    /// One word: `AlreadyExists`, `Forbidden`, `UnknownFramework`, `Invalid`, `Cut`, or the name of a gRPC code.
     pub reason: String,
     /// A sentence for people.
     pub message: String,
@@ -174,6 +174,9 @@ pub enum KubeconfigError {
     /// Data that should be base64 is not.
     #[error("{0} is not base64")]
     Base64(&'static str),
+    /// A token that could not be sent.
+    #[error("the token has characters that no token has")]
+    Token,
     /// The server's address cannot be dialled.
     #[error("{0:?} is not the address of a controller; write https://HOST:PORT")]
     Server(String),

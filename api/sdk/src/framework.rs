@@ -129,18 +129,22 @@ impl Builder {
         let state = StateFile::new(self.state_file);
         let subscribe = proto::Subscribe {
             name: self.name,
-            namespace: self.namespace.or(target.namespace).unwrap_or_default(),
+            namespace: self.namespace.or_else(|| target.namespace.clone()).unwrap_or_default(),
             framework_id: state.read().await?.unwrap_or_default(),
             position: position.map(|position| position.0),
             filter: self.filter.map(|filter| filter.0),
             failover_timeout_seconds: self.failover.map(|timeout| timeout.as_secs_f64()),
-            direct: true,
+            direct: target.has_certificate(),
             nonce: uuid::Uuid::new_v4().to_string(),
         };
         let (to_session, commands) = mpsc::channel(CALLS);
         let (to_stream, inlet) = event::channel();
         let stop = CancellationToken::new();
-        let link = Link { address: target.address, tls: Arc::new(tls) };
+        let link = Link {
+            address: target.address,
+            tls: Arc::new(tls),
+            authorization: target.authorization,
+        };
         let (lanes, relayed) = Lanes::new(Arc::new(direct), to_stream.clone());
         let inbox = Inbox { commands, relayed, lanes: lanes.clone() };
         let identity = Identity { subscribe, state };

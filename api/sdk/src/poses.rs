@@ -89,7 +89,7 @@ pub struct Replies {
 
 impl Publisher {
     /// Opens a stream to the controller of `kubeconfig`, or of `MUSTER_CONFIG`, `KUBECONFIG` or `~/.muster/config`,
-    /// whichever is found first. The credentials must be an administrator's.
+    /// whichever is found first. The credentials must be those of an `operator` or `admin`.
     ///
     /// # Errors
     ///
@@ -101,7 +101,12 @@ impl Publisher {
         let channel = tls::dial(&target.address, &Arc::new(tls)).await;
         let mut client = PoseServiceClient::new(channel.map_err(PublishError::Connect)?);
         let (batches, queue) = mpsc::channel(QUEUE);
-        let answer = client.publish(ReceiverStream::new(queue)).await;
+        let answer = client
+            .publish(kubeconfig::authorized(
+                ReceiverStream::new(queue),
+                target.authorization.as_ref(),
+            ))
+            .await;
         let heard = answer.map_err(|status| PublishError::Ended(Box::new(status)))?.into_inner();
         Ok((Publisher { batches }, Replies { heard }))
     }

@@ -1,6 +1,7 @@
 //! The resources. One file a kind: spec, status, rules. [`ALL`] is the one list of them, and
 //! [`admit`] the one gate that an object passes before it is stored, in the client and the server.
 
+pub mod access;
 pub mod application;
 pub mod config_map;
 pub mod event;
@@ -112,6 +113,7 @@ pub static ALL: &[KindInfo] = &[
     framework::INFO,
     quota::INFO,
     site::INFO,
+    access::INFO,
     config_map::INFO,
     secret::INFO,
     namespace::INFO,

@@ -12,7 +12,7 @@ pub(super) const COLUMNS: &[Column<Lease>] = &[
     Column::new("GROUP", |lease, _| lease.spec.group.as_str().into()),
     Column::new("EPOCH", |lease, _| status(lease, |s| s.epoch.to_string())),
     Column::new("HOLDER", |lease, _| match lease.status.as_ref().and_then(|s| s.holder.as_ref()) {
-        Some(holder) => format!("{}/{}", holder.namespace, holder.name).into(),
+        Some(holder) => holder.to_string().into(),
         None => Cell::new("free", Mood::Dim),
     }),
     Column::new("ACQUIRED", |lease, now| {

@@ -1,6 +1,7 @@
 //! Objects as rows: the columns of each kind, one file a kind, as `muster get` and the controller's `as=Table` show them.
 //! A kind without a file has only its name and age.
 
+mod access;
 pub mod application;
 pub mod event;
 pub mod framework;
@@ -144,6 +145,7 @@ pub fn columns(info: &KindInfo) -> &'static dyn Columns {
         (_, "Framework") => &Of(framework::COLUMNS),
         (_, "Quota") => &Of(quota::COLUMNS),
         (_, "Site") => &Of(site::COLUMNS),
+        (_, "Access") => &Of(access::COLUMNS),
         (_, "ConfigMap") => &Of(keyed::CONFIG_MAP),
         (_, "Secret") => &Of(keyed::SECRET),
         (_, "Namespace") => &Of(namespace::COLUMNS),

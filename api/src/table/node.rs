@@ -85,10 +85,7 @@ fn battery(status: &NodeStatus) -> String {
 /// `gmapping` for the holder of the only group; with several groups `arm=grasp,body=-`.
 fn holders(status: &NodeStatus) -> String {
     let of = |lease: &crate::kind::node::NodeLease| {
-        lease
-            .holder
-            .as_ref()
-            .map_or_else(|| "-".to_owned(), |h| format!("{}/{}", h.namespace, h.name))
+        lease.holder.as_ref().map_or_else(|| "-".to_owned(), ToString::to_string)
     };
     match &status.leases[..] {
         [] => String::new(),

@@ -309,6 +309,7 @@ pub fn node_order(spec: &NodeSpec) -> proto::NodeOrder {
     proto::NodeOrder {
         estop_tier: spec.estop.number(),
         estop_release: spec.estop_release.unwrap_or_default(),
+        ..proto::NodeOrder::default()
     }
 }
 
@@ -350,6 +351,7 @@ impl From<&NodeReport> for proto::NodeState {
                 })
                 .collect(),
             estop: report.estop.as_ref().map(proto::EStop::from),
+            person_epoch: 0,
             images: report.images.iter().map(proto::ImageState::from).collect(),
         }
     }

@@ -12,6 +12,7 @@ pub(crate) mod exec;
 pub(crate) mod fence;
 pub(crate) mod get;
 pub(crate) mod gone;
+pub(crate) mod lease;
 pub(crate) mod local;
 pub(crate) mod lock;
 pub(crate) mod logs;
@@ -25,6 +26,7 @@ pub(crate) mod simulate;
 pub(crate) mod token;
 pub(crate) mod top;
 mod transaction;
+mod user_token;
 pub(crate) mod version;
 pub(crate) mod wait;
 pub(crate) mod why;
@@ -95,6 +97,7 @@ pub(crate) async fn dispatch(command: Command, session: &mut Session) -> Outcome
         Command::Drain(args) => drain::run(args, session).await,
         Command::Estop(args) => estop::run(args, session).await,
         Command::Node(command) => node::run(command, session).await,
+        Command::Lease(command) => lease::run(command, session).await,
         Command::Token(command) => token::run(command, session).await,
         Command::Local(_) | Command::Version(_) => {
             unreachable!("these are run before a kubeconfig is read")

@@ -88,7 +88,7 @@ async fn register(args: RegisterArgs, session: &mut Session) -> Outcome {
     }
     let answer = make(&args.terms, Some(&args.name), session).await?;
     let token = secret(&answer, session)?;
-    session.ui.note(&format!("On the robot or server, within {}:\n", args.terms.ttl));
+    session.ui.note(&format!("On the robot or server, within {}:\n", args.terms.ttl()));
     session.ui.line(&join_command(
         &session.client.server,
         &token,

@@ -1,11 +1,11 @@
-//! `muster token`: tokens that agents show once to join.
+//! `muster token`: tokens that agents show once to join, and those of users (`user_token`).
 
 use jiff::Timestamp;
 use muster_api::duration::Span;
 use serde::Deserialize;
 use serde_json::{Value, json};
 
-use super::Outcome;
+use super::{Outcome, user_token};
 use crate::args::span;
 use crate::client::group_path;
 use crate::error::CliError;
@@ -18,12 +18,12 @@ use crate::session::Session;
 /// `muster token`.
 #[derive(Debug, clap::Subcommand)]
 pub(crate) enum Command {
-    /// Make a token; it is shown once
+    /// Make a token; it is shown once. With --user, of a person or a program instead of an agent
     Create(CreateArgs),
     /// List tokens, without their secrets
     #[command(visible_alias = "ls")]
     List(ListArgs),
-    /// Take tokens back; agents that have joined stay
+    /// Take tokens back; agents that have joined stay, users are out at once
     Delete {
         /// The tokens' ids
         #[arg(required = true)]
@@ -39,6 +39,15 @@ pub(crate) struct CreateArgs {
     /// Only for the agent of this node
     #[arg(long, value_name = "NAME")]
     node: Option<String>,
+    /// A token of this user, to whom Access objects give rights; it holds 8h
+    #[arg(long, value_name = "NAME", conflicts_with_all = ["node", "uses"])]
+    user: Option<String>,
+    /// A group that the user is in; may be given several times
+    #[arg(long = "group", value_name = "NAME", requires = "user")]
+    groups: Vec<String>,
+    /// Print a kubeconfig of the user, for `muster`, `kubectl` and the SDKs
+    #[arg(long, requires = "user", conflicts_with = "output")]
+    as_kubeconfig: bool,
     /// How to print it
     #[arg(short, long, value_enum, value_name = "FORMAT")]
     output: Option<Format>,
@@ -47,17 +56,27 @@ pub(crate) struct CreateArgs {
 /// How long and how often a token holds.
 #[derive(Debug, Clone, clap::Args)]
 pub(crate) struct Terms {
-    /// How long it holds
-    #[arg(long, value_name = "TIME", default_value = "1h", value_parser = span)]
-    pub(crate) ttl: Span,
+    /// How long it holds [default: 1h]
+    #[arg(long, value_name = "TIME", value_parser = span)]
+    ttl: Option<Span>,
     /// How many agents may use it [default: any number]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     uses: Option<u32>,
 }
 
+impl Terms {
+    /// How long a token for agents holds.
+    pub(crate) fn ttl(&self) -> Span {
+        self.ttl.unwrap_or_else(|| Span::from_secs(3600))
+    }
+}
+
 /// `muster token list`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct ListArgs {
+    /// Those of users
+    #[arg(long)]
+    users: bool,
     /// How to print them
     #[arg(short, long, value_enum, value_name = "FORMAT")]
     output: Option<Format>,
@@ -100,7 +119,12 @@ pub(crate) async fn run(command: Command, session: &mut Session) -> Outcome {
         Command::List(args) => list(args, session).await,
         Command::Delete { ids } => {
             for id in ids {
-                session.client.delete_path(&token_path(Some(&id))).await?;
+                match session.client.delete_path(&token_path(Some(&id))).await {
+                    Err(error) if error.is_not_found() => {
+                        session.client.delete_path(&user_token::token_path(Some(&id))).await?;
+                    }
+                    deleted => deleted?,
+                }
                 session.ui.line(&format!("token/{id} deleted"))?;
             }
             Ok(exit::OK)
@@ -116,6 +140,16 @@ fn token_path(id: Option<&str>) -> String {
 }
 
 async fn create(args: CreateArgs, session: &mut Session) -> Outcome {
+    if let Some(user) = args.user {
+        let new = user_token::New {
+            user,
+            groups: args.groups,
+            ttl_seconds: args.terms.ttl.map(|ttl| ttl.as_duration().as_secs().max(1)),
+            as_kubeconfig: args.as_kubeconfig,
+            output: args.output,
+        };
+        return user_token::create(new, session).await;
+    }
     let answer = make(&args.terms, args.node.as_deref(), session).await?;
     if let Some(format @ (Format::Yaml | Format::Json)) = args.output {
         session.ui.print(&document(&answer, format)?)?;
@@ -127,7 +161,7 @@ async fn create(args: CreateArgs, session: &mut Session) -> Outcome {
     let name = args.node.as_deref().unwrap_or("NAME");
     session.ui.note(&format!(
         "\nOn the robot or server, within {}:\n\n  {}",
-        args.terms.ttl,
+        args.terms.ttl(),
         join_command(&session.client.server, &token, name, "robot|cloud")
     ));
     Ok(exit::OK)
@@ -139,7 +173,7 @@ pub(crate) async fn make(
     node: Option<&str>,
     session: &Session,
 ) -> Result<Value, CliError> {
-    let mut spec = json!({"ttlSeconds": terms.ttl.as_duration().as_secs().max(1)});
+    let mut spec = json!({"ttlSeconds": terms.ttl().as_duration().as_secs().max(1)});
     if let Some(node) = node {
         spec["nodeName"] = node.into();
     }
@@ -173,6 +207,9 @@ fn read<T: serde::de::DeserializeOwned>(value: Value, session: &Session) -> Resu
 }
 
 async fn list(args: ListArgs, session: &mut Session) -> Outcome {
+    if args.users {
+        return user_token::list(args.output, session).await;
+    }
     let mut answer: Value = session.client.get_json(&token_path(None)).await?;
     match args.output {
         Some(format @ (Format::Yaml | Format::Json)) => {

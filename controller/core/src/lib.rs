@@ -10,7 +10,9 @@
 //!
 //! | module | decides |
 //! |---|---|
+//! | [`access`] | who may do what |
 //! | [`ledger`] | what each node has left, and who holds its actuators (invariants 1 and 2) |
+//! | [`person`] | whether a person gets a robot's lease |
 //! | [`poses`] | where every robot is now, and when that is written down |
 //! | [`space`] | which robots are nearest, without a scan |
 //! | [`site`] | how far robots have to go over a floor with walls, all at once |
@@ -39,6 +41,7 @@
 //! | [`report`] | typed reasons, with the words people read |
 #![deny(missing_docs)]
 
+pub mod access;
 pub mod apply;
 pub mod cluster;
 pub mod config;
@@ -52,6 +55,7 @@ pub mod ledger;
 pub mod node_health;
 pub mod offer;
 pub mod offload;
+pub mod person;
 pub mod poses;
 pub mod preempt;
 pub mod project;

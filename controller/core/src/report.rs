@@ -279,6 +279,10 @@ impl fmt::Display for Refusal {
             Refusal::Exhausted { shortage: s } => {
                 shortage(f, s, "left; waits until other tasks free it")
             }
+            // A person's holding has a uid and no task: `LeaseHolder::person`.
+            Refusal::LeaseHeld { group, holder } if holder.starts_with("user ") => {
+                write!(f, "actuators ({group}) are held by {holder}; waits until they are returned")
+            }
             Refusal::LeaseHeld { group, holder } => {
                 write!(
                     f,

@@ -4,7 +4,7 @@
 use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::MicroTime;
 use muster_api::id::Epoch;
-use muster_api::kind::lease::{Lease, LeaseHolder, LeaseSpec, LeaseStatus};
+use muster_api::kind::lease::{HolderKind, Lease, LeaseHolder, LeaseSpec, LeaseStatus};
 use muster_api::kind::task::{TaskLease, TaskStatus};
 use muster_api::phase::TaskPhase;
 use muster_controller_core::schedule::Bind;
@@ -50,6 +50,7 @@ pub(super) fn grants(
 ) -> Result<Vec<Op>, StoreError> {
     let grant = |(group, epoch): &(String, Epoch)| {
         let holder = LeaseHolder {
+            kind: HolderKind::Task,
             namespace: task.namespace().unwrap_or_default().to_owned(),
             name: task.name.to_string(),
             uid: bind.uid.clone(),
@@ -59,6 +60,7 @@ pub(super) fn grants(
             holder: Some(holder),
             acquired: Some(MicroTime(now)),
             renewed: None,
+            fence: None,
         };
         grant_op(store, bind.node.as_str(), group, status)
     };
@@ -88,7 +90,8 @@ fn grant_op(store: &Store, node: &str, group: &str, status: LeaseStatus) -> Resu
         let (expected, actual) = (stored.revision.saturating_sub(1), stored.revision);
         return Err(StoreError::Conflict { key, expected, actual });
     }
-    lease.status = Some(status);
+    // What a person fenced off stays so.
+    lease.status = Some(LeaseStatus { fence: before.fence, ..status });
     Ok(objects::replace(&stored, &lease))
 }
 

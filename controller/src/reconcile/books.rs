@@ -8,7 +8,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use futures::future::join_all;
-use muster_api::kind::lease::LeaseHolder;
+use muster_api::kind::lease::{HolderKind, LeaseHolder};
 use muster_api::kind::node::{Node, NodeLease, NodeStatus};
 use muster_api::name::NodeName;
 use muster_api::resource::Compute;
@@ -38,10 +38,14 @@ impl From<&NodeLedger> for Page {
     fn from(ledger: &NodeLedger) -> Self {
         let lease = |(name, group): (&str, &muster_controller_core::ledger::Group)| {
             let holder = group.holder.as_ref().map(|uid| {
+                if let Some(person) = LeaseHolder::person_of(uid) {
+                    return person;
+                }
                 let title =
                     ledger.reservation(uid).map(|r| r.title.to_string()).unwrap_or_default();
                 let (namespace, name) = title.split_once('/').unwrap_or_default();
                 LeaseHolder {
+                    kind: HolderKind::Task,
                     namespace: namespace.to_owned(),
                     name: name.to_owned(),
                     uid: uid.clone(),

@@ -20,6 +20,7 @@ use muster_api::kind::framework::FrameworkSpec;
 use muster_api::kind::task::NodeRefusal;
 use muster_api::name::NodeName;
 use muster_api::wire::framework::v1 as wire;
+use muster_controller_core::access::Verb;
 use muster_controller_core::cluster::Cluster;
 use muster_controller_core::node_health::Monotonic;
 use muster_controller_core::offer::allocator::Closest;
@@ -33,6 +34,8 @@ use tokio::time::Instant;
 
 use super::RETRY;
 use super::bind;
+use crate::audit::{Line, Named};
+use crate::auth::Identity;
 use crate::context::Context;
 use crate::session::frameworks::convert;
 use crate::store::{Key, Op, Precondition, StoreError};
@@ -51,6 +54,7 @@ struct Guest {
 struct Pending {
     uid: FrameworkUid,
     session: u64,
+    by: Arc<Identity>,
     call: String,
     launches: Vec<Prepared>,
     guard: Option<Op>,
@@ -122,7 +126,7 @@ impl Desk {
             // One transaction: all of it is there, or nothing. What ended meanwhile is there until it is acknowledged.
             let outlet = self.guests.get(&seat).and_then(|g| g.outlet_of(pending.session));
             if pending.launches.iter().any(is_there) {
-                launched_all(outlet, pending, &binds);
+                launched_all(&self.context, outlet, pending, &binds);
             } else {
                 freed.extend(binds.iter().filter_map(|bind| cluster.withdraw(&bind.uid)));
                 refuse(outlet, pending.call, convert::unavailable());
@@ -197,8 +201,8 @@ impl Desk {
                     drop(self.book.decline(cluster, *seat, &offers, (refuse, now)));
                 }
             }
-            Request::Accept { uid, session, call, offers, launches, refuse, guard } => {
-                let pending = Pending { uid, session, call, launches, guard };
+            Request::Accept { uid, session, by, call, offers, launches, refuse, guard } => {
+                let pending = Pending { uid, session, by, call, launches, guard };
                 self.accept(cluster, pending, (offers, refuse));
             }
             Request::Leave { uid, session } => {
@@ -336,7 +340,7 @@ impl Desk {
         for ((seat, pending, binds), result) in passed.into_iter().zip(results) {
             let outlet = self.guests.get(&seat).and_then(|g| g.outlet_of(pending.session));
             match result {
-                Ok(_) => launched_all(outlet, pending, &binds),
+                Ok(_) => launched_all(&self.context, outlet, pending, &binds),
                 Err(error) if crate::objects::is_race(&error) => {
                     release(cluster, binds.iter());
                     refuse(outlet, pending.call, not_written(&pending.launches, &error));
@@ -444,8 +448,25 @@ fn release<'a>(cluster: &mut Cluster, binds: impl Iterator<Item = &'a Bind>) {
 }
 
 /// Everything of an Accept is written.
-fn launched_all(outlet: Option<&Outlet>, pending: Pending, binds: &[Bind]) {
+fn launched_all(context: &Context, outlet: Option<&Outlet>, pending: Pending, binds: &[Bind]) {
     metrics::counter!("muster_framework_launches_total").increment(binds.len() as u64);
+    let named = |prepared: &Prepared| Named {
+        kind: Some("Task".to_owned()),
+        namespace: prepared.key.namespace().map(str::to_owned),
+        name: Some(prepared.key.name.to_string()),
+        uid: Some(prepared.uid.to_string()),
+    };
+    let line = Line {
+        time: context.clock.now(),
+        objects: pending.launches.iter().map(named).collect(),
+        code: Some(201),
+        ..Line::of(&pending.by, Verb::Create, "tasks")
+    };
+    if !pending.launches.is_empty() {
+        // A framework that were told that it failed would launch everything twice. The log counts what it lacks, and the
+        // next Accept waits until it can be written.
+        drop(context.audit.write(&line));
+    }
     let launched = pending.launches.iter().zip(binds).map(launched).collect();
     answer(outlet, wire::Answer { id: pending.call, refusal: None, launched });
 }

@@ -1,9 +1,11 @@
-//! Tells agents what people decide about their nodes: emergency stops and their releases. A stream of orders begins with them;
+//! Tells agents what people decide about their nodes: emergency stops and their releases, and
+//! whether a person holds the actuators. A stream of orders begins with them;
 //! this says what changes afterwards, at once.
 
 use std::collections::HashMap;
 use std::sync::Arc;
 
+use muster_api::kind::lease::Lease;
 use muster_api::kind::node::Node;
 use muster_api::name::NodeName;
 use muster_api::wire::agent::v1 as wire;
@@ -11,12 +13,13 @@ use muster_api::wire::agent_session::node_order;
 
 use super::{next_events, watch_from_now};
 use crate::context::Context;
-use crate::objects::{self, NODES};
+use crate::objects::{self, LEASES, NODES};
 use crate::session::Sessions;
 use crate::store::{Change, Stored};
 
 /// What no node orders: what its agent was told is not known.
-const UNKNOWN: wire::NodeOrder = wire::NodeOrder { estop_tier: u32::MAX, estop_release: 0 };
+const UNKNOWN: wire::NodeOrder =
+    wire::NodeOrder { estop_tier: u32::MAX, estop_release: 0, lease_fence: 0, lease_held: false };
 
 /// Works until dropped.
 pub async fn run(context: Arc<Context>, sessions: Arc<Sessions>) {
@@ -37,7 +40,15 @@ async fn follow(context: &Context, sessions: &Sessions) {
         }
         tell(sessions, &mut told, stored);
     }
+    for stored in &context.store.list(LEASES, None).items {
+        tell_lease(sessions, stored);
+    }
     while let Some(events) = next_events(&mut watcher).await {
+        for event in events.iter().filter(|event| event.object.key.resource == LEASES) {
+            if event.change == Change::Put {
+                tell_lease(sessions, &event.object);
+            }
+        }
         for event in events.iter().filter(|event| event.object.key.resource == NODES) {
             match event.change {
                 Change::Put => tell(sessions, &mut told, &event.object),
@@ -71,6 +82,15 @@ fn tell(sessions: &Sessions, told: &mut HashMap<Arc<str>, wire::NodeOrder>, stor
     }
     if let Some(name) = node_name(stored) {
         sessions.orders().say(&name, stored.revision, order);
+    }
+}
+
+/// Most leases were never a person's, and are not read.
+fn tell_lease(sessions: &Sessions, stored: &Stored) {
+    if stored.mentions("fence")
+        && let Some(lease) = objects::read::<Lease>(stored)
+    {
+        sessions.orders().tell_lease(&lease, stored.revision);
     }
 }
 

@@ -204,6 +204,7 @@ fn resources(of: &ApiGroup) -> Vec<Shown> {
         "authorization.k8s.io" => vec![
             simple("selfsubjectaccessreviews", "SelfSubjectAccessReview", false, &["create"]),
             simple("selfsubjectrulesreviews", "SelfSubjectRulesReview", false, &["create"]),
+            simple("subjectaccessreviews", "SubjectAccessReview", false, &["create"]),
         ],
         metrics_api::GROUP => vec![
             simple("nodes", "NodeMetrics", false, &["get", "list"]),
@@ -257,6 +258,11 @@ fn resource(entry: &Entry) -> Vec<Shown> {
             sub("attach", None, "PodAttachOptions", &["create", "get"]);
             sub("eviction", Some(("policy", "v1")), "Eviction", &["create"]);
             sub("exec", None, "PodExecOptions", &["create", "get"]);
+        }
+        (_, "Lease") => {
+            sub("acquire", None, "LeaseRequest", &["create"]);
+            sub("return", None, "LeaseRequest", &["create"]);
+            sub("take", None, "LeaseRequest", &["create"]);
         }
         (GROUP, "Node") => sub("fence", None, "NodeFence", &["create"]),
         (_, "TaskSet") => {

@@ -3,9 +3,10 @@
 use axum::response::{IntoResponse, Response};
 use http::{Method, StatusCode};
 use muster_api::validate::Violations;
+use muster_controller_core::access::{Action, Denied};
 use serde_json::{Value, json};
 
-use super::path::{Object, Target, Verb};
+use super::path::{Object, Verb};
 use super::registry::Entry;
 use crate::store::StoreError;
 
@@ -29,6 +30,11 @@ impl Failure {
     #[must_use]
     pub fn code(&self) -> u16 {
         self.code.as_u16()
+    }
+
+    /// The word for it.
+    pub(crate) fn reason(&self) -> &'static str {
+        self.reason
     }
 
     /// What it says to people.
@@ -57,9 +63,26 @@ impl Failure {
         Self::new(StatusCode::FORBIDDEN, "Forbidden", message)
     }
 
-    pub(crate) fn forbidden(who: &str, verb: Verb, target: &Target) -> Self {
-        let what = target.resource().unwrap_or("this path");
-        Self::denied(format!("{what} is forbidden: {who:?} may not {} it", verb.as_str()))
+    /// 403 as Kubernetes words it, and why.
+    pub(crate) fn forbidden(who: &str, action: &Action<'_>, denied: &Denied) -> Self {
+        let Action { verb, group, resource, subresource, namespace, name } = action;
+        let qualified = match group.is_empty() {
+            true => (*resource).to_owned(),
+            false => format!("{resource}.{group}"),
+        };
+        let named = name.map(|name| format!(" {name:?}")).unwrap_or_default();
+        let part = subresource.map(|part| format!("/{part}")).unwrap_or_default();
+        let place = match namespace {
+            Some(namespace) => format!("in the namespace {namespace:?}"),
+            None => "at the cluster scope".to_owned(),
+        };
+        let mut failure = Self::denied(format!(
+            "{qualified}{named} is forbidden: User {who:?} cannot {} resource \"{resource}{part}\" in API group \
+             {group:?} {place}: {denied}",
+            verb.as_str()
+        ));
+        failure.details = json!({"name": name, "group": group, "kind": resource});
+        failure
     }
 
     pub(crate) fn unknown_path(path: &str) -> Self {

@@ -50,7 +50,7 @@ struct Word<'a> {
 pub(super) async fn fence(call: Call, target: Object) -> Answer {
     let key = target.key()?;
     let node = NodeName::new(&*key.name).map_err(|e| Failure::bad_request(e.to_string()))?;
-    let Call { context, request, identity, .. } = call;
+    let Call { context, request, asker, .. } = call;
     let (parts, body) = request.into_parts();
     let asked: Request = body::typed("NodeFence", body::json(&parts.headers, body).await?)?;
     let reason = asked.reason.trim().to_owned();
@@ -60,8 +60,8 @@ pub(super) async fn fence(call: Call, target: Object) -> Answer {
         return Err(Failure::invalid_body("NodeFence", &violations));
     }
     let who = match asked.by.as_deref().map(str::trim).filter(|by| !by.is_empty()) {
-        Some(by) => format!("{by} (through {})", identity.name()),
-        None => identity.name(),
+        Some(by) => format!("{by} (through {})", asker.identity.name()),
+        None => asker.identity.name(),
     };
     let word = Word { node: &node, who, reason };
     let live =

@@ -13,6 +13,7 @@ use serde_json::json;
 use super::enrol::{self, Candidate, Right};
 use super::failure::Failure;
 use super::{Answer, Call, body, token};
+use crate::audit::Named;
 use crate::auth::Identity;
 use crate::context::Context;
 
@@ -29,7 +30,7 @@ struct Request {
 }
 
 pub(super) async fn join(call: Call) -> Answer {
-    let Call { context, request, identity, .. } = call;
+    let Call { context, request, asker, .. } = call;
     let (parts, body) = request.into_parts();
     let body = body::json(&parts.headers, body).await?;
     let asked: Request = serde_json::from_value(body)
@@ -45,20 +46,21 @@ pub(super) async fn join(call: Call) -> Answer {
     let candidate =
         Candidate { node: &asked.node_name, kind: asked.kind, key: key_of(&certificate)? };
     let taken = enrol::check(&context, &candidate)?;
-    let right = right(&context, &asked, &identity, taken).await?;
+    let right = right(&context, &asked, &asker.identity, taken).await?;
     enrol::enrol(&context, &candidate, right).await?;
     // Whoever spoke for the node until now has to show the key that counts.
     if let (Some(live), Ok(name)) = (context.live(), asked.node_name.parse()) {
         live.sessions.kick(&name);
     }
     tracing::info!(node = asked.node_name, kind = ?asked.kind, ?right, "joined");
-    Ok(super::json(
-        StatusCode::OK,
-        &json!({
-            "certificate": certificate,
-            "ca": context.pki.ca(),
-        }),
-    ))
+    let answer = json!({ "certificate": certificate, "ca": context.pki.ca() });
+    let mut response = super::json(StatusCode::OK, &answer);
+    response.extensions_mut().insert(Named {
+        kind: Some("Node".to_owned()),
+        name: Some(asked.node_name),
+        ..Named::default()
+    });
+    Ok(response)
 }
 
 async fn right(

@@ -17,10 +17,12 @@
 //! | `selector` | label and field selectors |
 //! | [`namespace`] | the default namespace; ending of namespaces |
 //! | [`token`], `join`, `enrol` | join tokens; certificates for agents; which agent speaks for a node |
+//! | `user_token` | tokens of users |
 //! | `scale` | how many tasks a set has, as `autoscaling/v1` Scale |
 //! | `core_view`, `eviction`, `metrics_api` | what is written through core kinds; `kubectl drain`, `kubectl top` |
 //! | `review` | what a client may do, and who it is |
 //! | `fence` | a person's word that a node is off |
+//! | `lease` | a person's hold on a robot's actuators |
 //! | `offers` | what frameworks are offered, and why they are not |
 //! | `poses` | where robots are now |
 //! | `together` | what objects have wrong only all together |
@@ -46,6 +48,7 @@ mod form;
 #[cfg(test)]
 mod hostile;
 mod join;
+mod lease;
 mod list;
 pub mod log;
 mod metadata;
@@ -58,11 +61,11 @@ mod patch;
 pub mod path;
 mod poses;
 mod protobuf;
-mod query;
+pub(crate) mod query;
 mod question;
 pub(crate) mod registry;
 mod rendered;
-mod review;
+pub(crate) mod review;
 mod scale;
 mod selector;
 mod sets;
@@ -72,6 +75,7 @@ mod together;
 pub mod token;
 mod transaction;
 mod update;
+pub(crate) mod user_token;
 mod watch;
 
 use std::sync::Arc;
@@ -84,7 +88,8 @@ use axum::response::{IntoResponse as _, Response};
 use http::{HeaderValue, Method, Request, StatusCode, header};
 use serde_json::Value;
 
-use crate::auth::{Identity, Permission, permits};
+use crate::audit::entry::Entry;
+use crate::auth::{self, Asker, Identity};
 use crate::context::Context;
 pub use body::Bodies;
 use body::Room;
@@ -109,7 +114,7 @@ pub(crate) type Answer = Result<Response, Failure>;
 /// One request, read.
 pub(crate) struct Call {
     pub(crate) context: Arc<Context>,
-    pub(crate) identity: Identity,
+    pub(crate) asker: Asker,
     pub(crate) query: Query,
     pub(crate) request: Request<Body>,
 }
@@ -146,18 +151,37 @@ async fn handle(State(context): State<Arc<Context>>, request: Request<Body>) -> 
     response
 }
 
-/// Takes the request whole, finds it a place, and answers it in time. One that lasts needs no place and has no deadline.
+/// Answers who may ask; what changes something has its line in the audit log before it is answered.
 async fn answer(
     context: Arc<Context>,
     (verb, target, long): (Verb, Target, bool),
     request: Request<Body>,
 ) -> Answer {
+    let asker = Asker::of(&context, request.extensions());
+    let entry = Entry::begin(&context, &asker, (verb, &target), &request)?;
+    let answer = match asker.needs(&auth::asked(verb, &target)) {
+        Ok(()) => admitted(context, asker, (verb, target, long), request).await,
+        Err(failure) => Err(failure),
+    };
+    match entry {
+        Some(entry) => entry.end(answer).await,
+        None => answer,
+    }
+}
+
+/// Takes the request whole, finds it a place, and answers it in time. One that lasts needs no place and has no deadline.
+async fn admitted(
+    context: Arc<Context>,
+    asker: Asker,
+    (verb, target, long): (Verb, Target, bool),
+    request: Request<Body>,
+) -> Answer {
     let late = "the request did not come in time";
     // The room of its body is taken until it is answered.
-    let received = receive(&context.bodies, (verb, &target), request);
-    let (identity, request, _room) = within(BODY, late, received).await?;
+    let received = receive(&context.bodies, &asker.identity, &target, request);
+    let (request, _room) = within(BODY, late, received).await?;
     let query = Query::read(request.uri())?;
-    let call = Call { context: Arc::clone(&context), identity, query, request };
+    let call = Call { context: Arc::clone(&context), asker, query, request };
     if long {
         return dispatch(call, verb, target).await;
     }
@@ -182,28 +206,21 @@ async fn within<T>(
     }
 }
 
-/// Who sends it, if they may, and the request with its body.
+/// The request with its body.
 async fn receive(
     bodies: &Bodies,
-    (verb, target): (Verb, &Target),
+    identity: &Identity,
+    target: &Target,
     request: Request<Body>,
-) -> Result<(Identity, Request<Body>, Option<Room>), Failure> {
-    let identity = request.extensions().get::<Identity>().cloned().unwrap_or(Identity::Anonymous);
-    match permits(&identity, verb, target) {
-        Permission::Granted => {}
-        Permission::WhoAreYou => {
-            return Err(Failure::unauthorized("a client certificate is needed"));
-        }
-        Permission::Denied => return Err(Failure::forbidden(&identity.name(), verb, target)),
-    }
+) -> Result<(Request<Body>, Option<Room>), Failure> {
     if matches!(*request.method(), Method::GET | Method::HEAD) {
-        return Ok((identity, request, None));
+        return Ok((request, None));
     }
     // Whole, before anything of it is refused: who still writes when the answer comes does not read it, and sees a broken
     // connection instead.
     let (parts, body) = request.into_parts();
-    let (bytes, room) = bodies.of(&identity).gather(body, body::limit(target)).await?;
-    Ok((identity, Request::from_parts(parts, Body::from(bytes)), room))
+    let (bytes, room) = bodies.of(identity).gather(body, body::limit(target)).await?;
+    Ok((Request::from_parts(parts, Body::from(bytes)), room))
 }
 
 async fn dispatch(call: Call, verb: Verb, target: Target) -> Answer {
@@ -220,10 +237,11 @@ async fn dispatch(call: Call, verb: Verb, target: Target) -> Answer {
         Target::Check => together::check(call).await,
         Target::Transaction => transaction::transaction(call).await,
         Target::Usage => question::usage(&call),
-        Target::Offers => offers::list(call.context).await,
+        Target::Offers => offers::list(call).await,
         Target::Poses if verb == Verb::Watch => poses::watch(&call),
         Target::Poses => poses::list(&call),
         Target::Tokens(id) => token::answer(call, verb, id).await,
+        Target::UserTokens(id) => user_token::answer(call, verb, id).await,
         Target::Objects(object) => objects(call, verb, object).await,
     }
 }
@@ -243,6 +261,9 @@ async fn objects(call: Call, verb: Verb, object: Object) -> Answer {
     }
     if object.subresource == Some(Subresource::Fence) {
         return fence::fence(call, object).await;
+    }
+    if let Some(Subresource::Lease(step)) = object.subresource {
+        return lease::answer(call, object, step).await;
     }
     if object.subresource == Some(Subresource::Scale) {
         return scale::answer(call, verb, object).await;
@@ -310,9 +331,10 @@ mod tests {
         let never =
             Body::from_stream(futures::stream::pending::<Result<bytes::Bytes, std::io::Error>>());
         let request = Request::post("/apis/muster.dev/v1alpha1/join").body(never).unwrap();
-        let (verb, target) = path::read(request.method(), request.uri()).unwrap();
+        let (_, target) = path::read(request.method(), request.uri()).unwrap();
         let bodies = Bodies::default();
-        let late = within(BODY, "too late", receive(&bodies, (verb, &target), request)).await;
+        let received = receive(&bodies, &Identity::Anonymous, &target, request);
+        let late = within(BODY, "too late", received).await;
         assert_eq!(late.unwrap_err().code(), 504);
     }
 
@@ -320,11 +342,10 @@ mod tests {
     async fn strangers_send_little_and_take_no_room_of_others() {
         let bodies = Bodies::default();
         let send = async |identity: Identity, path: &str, size: usize| {
-            let mut request = Request::post(path).body(Body::from(vec![b' '; size])).unwrap();
-            request.extensions_mut().insert(identity);
-            let (verb, target) = path::read(request.method(), request.uri()).unwrap();
-            let received = receive(&bodies, (verb, &target), request).await;
-            received.map(|(_, request, room)| (request, room)).map_err(|failure| failure.code())
+            let request = Request::post(path).body(Body::from(vec![b' '; size])).unwrap();
+            let (_, target) = path::read(request.method(), request.uri()).unwrap();
+            let received = receive(&bodies, &identity, &target, request).await;
+            received.map_err(|failure| failure.code())
         };
         let (join, plan) = ("/apis/muster.dev/v1alpha1/join", "/apis/muster.dev/v1alpha1/plan");
         let admin = || Identity::Admin { name: "a".into() };

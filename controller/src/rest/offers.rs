@@ -3,20 +3,29 @@
 use std::sync::Arc;
 
 use http::StatusCode;
+use muster_controller_core::access::{Action, Asked};
 use serde_json::json;
 use tokio::sync::oneshot;
 
-use super::Answer;
 use super::failure::Failure;
-use super::path::Object;
+use super::path::{Object, Verb};
+use super::{Answer, Call};
 use crate::context::Context;
 use crate::reconcile::desk::{Depth, Request};
 
-/// GET …/offers: every framework at the desk with its share and its offers.
-pub(super) async fn list(context: Arc<Context>) -> Answer {
+/// GET …/offers: every framework at the desk that the client may read, with its share and its offers.
+pub(super) async fn list(call: Call) -> Answer {
+    let Call { context, asker, .. } = call;
     let live = super::question::live(&context)?;
-    let frameworks = live.frameworks.look(Depth::Offers).await;
+    let mut frameworks = live.frameworks.look(Depth::Offers).await;
+    frameworks.retain(|view| asker.may(&read_in("frameworks", &view.namespace)));
     Ok(super::json(StatusCode::OK, &json!({ "frameworks": frameworks })))
+}
+
+/// Reading objects of a kind in a namespace.
+pub(super) fn read_in<'a>(resource: &'a str, namespace: &'a str) -> Asked<'a> {
+    let (verb, group, namespace) = (Verb::List, muster_api::GROUP, Some(namespace));
+    Asked::Right(Action { verb, group, resource, subresource: None, namespace, name: None })
 }
 
 /// GET …/frameworks/NAME/why: why each node is not offered to it.

@@ -1,6 +1,8 @@
 //! URL and method → what is asked for.
 
 use http::{Method, Uri};
+pub use muster_controller_core::access::Verb;
+use muster_controller_core::person::Step;
 
 use super::discovery::{self, ApiGroup};
 use super::failure::Failure;
@@ -10,61 +12,6 @@ use super::registry::{self, Entry, View};
 use super::review::Review;
 use crate::objects::NODES;
 use crate::store::Key;
-
-/// What a request does, in Kubernetes' words.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Verb {
-    /// Read one object.
-    Get,
-    /// Read a collection.
-    List,
-    /// Follow changes.
-    Watch,
-    /// POST.
-    Create,
-    /// PUT.
-    Update,
-    /// PATCH.
-    Patch,
-    /// DELETE of one object.
-    Delete,
-    /// DELETE of a collection.
-    DeleteCollection,
-}
-
-impl Verb {
-    /// The word, as in a resource's list of verbs.
-    #[must_use]
-    pub const fn as_str(self) -> &'static str {
-        match self {
-            Self::Get => "get",
-            Self::List => "list",
-            Self::Watch => "watch",
-            Self::Create => "create",
-            Self::Update => "update",
-            Self::Patch => "patch",
-            Self::Delete => "delete",
-            Self::DeleteCollection => "deletecollection",
-        }
-    }
-}
-
-impl Verb {
-    /// The verb of this name.
-    pub(crate) fn named(name: &str) -> Option<Self> {
-        let all = [
-            Self::Get,
-            Self::List,
-            Self::Watch,
-            Self::Create,
-            Self::Update,
-            Self::Patch,
-            Self::Delete,
-            Self::DeleteCollection,
-        ];
-        all.into_iter().find(|verb| verb.as_str() == name)
-    }
-}
 
 /// Which question about health.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -111,6 +58,28 @@ pub enum Subresource {
     Exec,
     /// `…/attach`
     Attach,
+    /// `…/acquire`, `…/take`, `…/return`
+    Lease(Step),
+}
+
+impl Subresource {
+    /// The last part of its path.
+    pub(crate) const fn as_str(self) -> &'static str {
+        match self {
+            Self::Status => "status",
+            Self::Log => "log",
+            Self::Why => "why",
+            Self::Fence => "fence",
+            Self::Pose => "pose",
+            Self::Scale => "scale",
+            Self::Eviction => "eviction",
+            Self::Exec => "exec",
+            Self::Attach => "attach",
+            Self::Lease(Step::Acquire) => "acquire",
+            Self::Lease(Step::Take) => "take",
+            Self::Lease(Step::Return) => "return",
+        }
+    }
 }
 
 /// One object, or a collection when `name` is `None`.
@@ -137,7 +106,8 @@ impl Object {
                 Subresource::Fence
                 | Subresource::Eviction
                 | Subresource::Exec
-                | Subresource::Attach,
+                | Subresource::Attach
+                | Subresource::Lease(_),
             ) => verb == Verb::Create,
             Some(Subresource::Scale) => matches!(verb, Verb::Get | Verb::Update | Verb::Patch),
             Some(Subresource::Status) => {
@@ -184,6 +154,8 @@ pub(crate) enum Target {
     Poses,
     /// Join tokens; one when it is named.
     Tokens(Option<String>),
+    /// Tokens of users; one when it is named.
+    UserTokens(Option<String>),
     Objects(Object),
 }
 
@@ -195,6 +167,7 @@ impl Target {
             Self::Measured(_) => Some("metrics"),
             Self::Review(_) => Some("reviews"),
             Self::Tokens(_) => Some("jointokens"),
+            Self::UserTokens(_) => Some("usertokens"),
             Self::Join => Some("join"),
             Self::Plan => Some("plan"),
             Self::Check => Some("check"),
@@ -237,6 +210,9 @@ pub(crate) fn read(method: &Method, uri: &Uri) -> Result<(Verb, Target), Failure
         ["apis", "authorization.k8s.io", "v1", "selfsubjectaccessreviews"] => {
             Target::Review(Review::Access)
         }
+        ["apis", "authorization.k8s.io", "v1", "subjectaccessreviews"] => {
+            Target::Review(Review::OfOthers)
+        }
         ["apis", "authorization.k8s.io", "v1", "selfsubjectrulesreviews"] => {
             Target::Review(Review::Rules)
         }
@@ -257,13 +233,15 @@ pub(crate) fn read(method: &Method, uri: &Uri) -> Result<(Verb, Target), Failure
             ["poses"] => Target::Poses,
             ["jointokens"] => Target::Tokens(None),
             ["jointokens", id] => Target::Tokens(Some((*id).to_owned())),
+            ["usertokens"] => Target::UserTokens(None),
+            ["usertokens", id] => Target::UserTokens(Some((*id).to_owned())),
             _ => Target::Objects(object(muster_api::GROUP, rest).ok_or_else(unknown)?),
         },
         _ => return Err(unknown()),
     };
     let named = match &target {
         Target::Objects(object) => object.name.is_some(),
-        Target::Tokens(id) => id.is_some(),
+        Target::Tokens(id) | Target::UserTokens(id) => id.is_some(),
         Target::Poses => false,
         Target::Measured(measured) => measured.name.is_some(),
         _ => true,
@@ -346,26 +324,35 @@ fn object(group: &str, parts: &[&str]) -> Option<Object> {
     let entry = registry::find(group, plural)?;
     let subresource = match sub {
         None => None,
-        Some("status") if entry.info.has_status => Some(Subresource::Status),
-        Some("log") if entry.has_log => Some(Subresource::Log),
-        Some("why") if entry.has_why => Some(Subresource::Why),
-        Some("fence") if entry.resource == NODES && entry.view == View::Stored => {
-            Some(Subresource::Fence)
-        }
-        Some("pose") if entry.resource == NODES && entry.view == View::Stored => {
-            Some(Subresource::Pose)
-        }
-        Some("eviction") if entry.info.kind == "Pod" => Some(Subresource::Eviction),
-        Some("exec") if entry.info.kind == "Pod" => Some(Subresource::Exec),
-        Some("attach") if entry.info.kind == "Pod" => Some(Subresource::Attach),
-        Some("scale") if entry.info.kind == "TaskSet" => Some(Subresource::Scale),
-        Some(_) => return None,
+        Some(sub) => Some(subresource(entry, sub)?),
     };
     // An object of a namespaced kind has no path outside its namespace.
     if entry.info.namespaced && namespace.is_none() && name.is_some() {
         return None;
     }
     Some(Object { entry, namespace, name, subresource })
+}
+
+/// The part of an object of this kind that is called so.
+pub(super) fn subresource(entry: &Entry, name: &str) -> Option<Subresource> {
+    let is_lease = entry.info.kind == "Lease";
+    let stored_node = entry.resource == NODES && entry.view == View::Stored;
+    let there = match name {
+        "status" => (Subresource::Status, entry.info.has_status),
+        "log" => (Subresource::Log, entry.has_log),
+        "why" => (Subresource::Why, entry.has_why),
+        "fence" => (Subresource::Fence, stored_node),
+        "pose" => (Subresource::Pose, stored_node),
+        "eviction" => (Subresource::Eviction, entry.info.kind == "Pod"),
+        "exec" => (Subresource::Exec, entry.info.kind == "Pod"),
+        "attach" => (Subresource::Attach, entry.info.kind == "Pod"),
+        "scale" => (Subresource::Scale, entry.info.kind == "TaskSet"),
+        "acquire" => (Subresource::Lease(Step::Acquire), is_lease),
+        "take" => (Subresource::Lease(Step::Take), is_lease),
+        "return" => (Subresource::Lease(Step::Return), is_lease),
+        _ => return None,
+    };
+    there.1.then_some(there.0)
 }
 
 #[cfg(test)]
@@ -461,6 +448,12 @@ mod tests {
                 "create tasks ns=Some(\"a\") name=Some(\"t\") sub=Some(Attach)",
             ),
             ("GET", format!("{g}/namespaces/a/tasks/t/exec"), "404"),
+            (
+                "POST",
+                format!("{g}/leases/n.body/take"),
+                "create leases ns=None name=Some(\"n.body\") sub=Some(Lease(Take))",
+            ),
+            ("POST", format!("{g}/nodes/n/take"), "404"),
             ("GET", "/api/v1/nodes/n/pose".into(), "404"),
             ("GET", "/apis/metrics.k8s.io/v1beta1/things".into(), "404"),
             ("POST", "/openapi/v3".into(), "405"),

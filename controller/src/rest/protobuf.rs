@@ -190,6 +190,23 @@ struct AccessSpec {
     resource: Option<ResourceAttributes>,
     #[prost(message, optional, tag = "2")]
     other: Option<OtherAttributes>,
+    /// This and the next of a review of others.
+    #[prost(string, tag = "3")]
+    user: String,
+    #[prost(string, repeated, tag = "4")]
+    groups: Vec<String>,
+}
+
+#[derive(Clone, PartialEq, Message)]
+struct RulesReview {
+    #[prost(message, optional, tag = "2")]
+    spec: Option<RulesSpec>,
+}
+
+#[derive(Clone, PartialEq, Message)]
+struct RulesSpec {
+    #[prost(string, tag = "1")]
+    namespace: String,
 }
 
 #[derive(Clone, PartialEq, Message)]
@@ -231,9 +248,12 @@ pub(super) fn json(bytes: &[u8]) -> Result<Value, Failure> {
             let options = delete_options(o.delete_options.unwrap_or_default());
             json!({"metadata": metadata(o.metadata), "deleteOptions": options})
         }),
-        "SelfSubjectAccessReview" => AccessReview::decode(raw).map(review),
-        // Of these nothing is read.
-        "SelfSubjectReview" | "SelfSubjectRulesReview" => Ok(json!({})),
+        "SelfSubjectAccessReview" | "SubjectAccessReview" => AccessReview::decode(raw).map(review),
+        "SelfSubjectRulesReview" => RulesReview::decode(raw).map(
+            |review| json!({"spec": {"namespace": review.spec.unwrap_or_default().namespace}}),
+        ),
+        // Of this nothing is read.
+        "SelfSubjectReview" => Ok(json!({})),
         other => {
             let what = format!("application/vnd.kubernetes.protobuf of kind {other:?}");
             return Err(super::body::unsupported(&what, "application/json"));
@@ -403,7 +423,13 @@ fn review(review: AccessReview) -> Value {
                "resource": r.resource, "subresource": r.subresource, "name": r.name})
     });
     let other = spec.other.map(|o| json!({"path": o.path, "verb": o.verb}));
-    json!({"spec": {"resourceAttributes": resource, "nonResourceAttributes": other}})
+    let mut review =
+        json!({"spec": {"resourceAttributes": resource, "nonResourceAttributes": other}});
+    if !spec.user.is_empty() || !spec.groups.is_empty() {
+        review["spec"]["user"] = spec.user.into();
+        review["spec"]["groups"] = spec.groups.into();
+    }
+    review
 }
 
 #[cfg(test)]
@@ -467,11 +493,16 @@ mod tests {
         );
         let resource =
             ResourceAttributes { verb: "create".into(), ..ResourceAttributes::default() };
-        let review =
-            AccessReview { spec: Some(AccessSpec { resource: Some(resource), other: None }) };
+        let review = AccessReview {
+            spec: Some(AccessSpec { resource: Some(resource), ..AccessSpec::default() }),
+        };
         let read =
             json(&sent("authorization.k8s.io/v1", "SelfSubjectAccessReview", &review)).unwrap();
         assert_eq!(read["spec"]["resourceAttributes"]["verb"], "create");
+        let review = RulesReview { spec: Some(RulesSpec { namespace: "lab".into() }) };
+        let read =
+            json(&sent("authorization.k8s.io/v1", "SelfSubjectRulesReview", &review)).unwrap();
+        assert_eq!(read["spec"]["namespace"], "lab");
         assert_eq!(json(&sent("v1", "Pod", &Namespace::default())).unwrap_err().code(), 415);
         assert_eq!(json(b"{}").unwrap_err().code(), 400);
     }

@@ -15,7 +15,7 @@ use serde_json::{Value, json};
 
 use super::failure::Failure;
 use super::path::Object;
-use super::{Answer, Call, body, registry, sets};
+use super::{Answer, Call, body, registry, sets, together};
 use crate::context::{Context, Live};
 use crate::objects::TASKS;
 use crate::session::frameworks::owner_of;
@@ -30,7 +30,7 @@ fn ended<E: std::fmt::Display>(error: E) -> Failure {
     Failure::unavailable(error.to_string())
 }
 
-/// GET …/usage: the last sample of every connected node, read from its kernel.
+/// GET …/usage: the last sample of every connected node, read from its kernel; of its tasks those that the client may read.
 pub(super) fn usage(call: &Call) -> Answer {
     let live = live(&call.context)?;
     let (mut nodes, mut tasks) = (Vec::new(), Vec::new());
@@ -42,6 +42,10 @@ pub(super) fn usage(call: &Call) -> Answer {
         }));
         for task in &usage.tasks {
             let Some((_, key)) = live.sessions.board().find(&task.uid) else { continue };
+            let namespace = key.namespace().unwrap_or_default();
+            if !call.asker.may(&super::offers::read_in("tasks", namespace)) {
+                continue;
+            }
             let amount = task.usage.unwrap_or_default();
             tasks.push(json!({
                 "namespace": key.namespace(),
@@ -94,13 +98,14 @@ pub(super) async fn why(call: Call, target: Object) -> Answer {
 /// POST …/plan: what applying some objects would do. The real scheduler decides, on a copy of what it
 /// knows; nothing is changed.
 pub(super) async fn plan(call: Call) -> Answer {
-    let Call { context, request, .. } = call;
+    let Call { context, request, asker, .. } = call;
     let (parts, body) = request.into_parts();
     let body = body::json(&parts.headers, body).await?;
     let objects = body.get("objects").and_then(Value::as_array);
     let objects =
         objects.ok_or_else(|| Failure::bad_request("the body must be {\"objects\": […]}"))?;
     body::check_count(objects.len())?;
+    together::may_read(&asker, objects)?;
     let revision = context.store.revision();
     let (mut changes, mut demands, mut outcomes) = (Vec::new(), Vec::new(), Vec::new());
     for (i, object) in objects.iter().enumerate() {

@@ -6,17 +6,42 @@
 use std::collections::BTreeMap;
 
 use http::StatusCode;
+use muster_api::kind;
 use muster_api::kind::namespace::DEFAULT;
 use muster_api::kind::quota::{QUOTA_NAME, Quota, QuotaSpec};
 use muster_api::kind::task::Resources;
 use serde_json::{Value, json};
 
 use super::failure::Failure;
-use super::{Answer, Call, body, create, question};
+use super::path::{Object, Verb};
+use super::{Answer, Call, body, create, question, registry};
+use crate::auth::{self, Asker};
 use crate::context::Context;
 use crate::objects::{self, TASKS};
 use crate::quota;
 use crate::store::Key;
+
+/// Whether somebody may look at what these objects are now, each of them.
+///
+/// # Errors
+/// 403 for the first that they may not.
+pub(super) fn may_read(asker: &Asker, objects: &[Value]) -> Result<(), Failure> {
+    for object in objects {
+        let text = |pointer: &str| object.pointer(pointer).and_then(Value::as_str);
+        let (version, kind) = (text("/apiVersion"), text("/kind"));
+        let info = kind::find(version.unwrap_or_default(), kind.unwrap_or_default());
+        // What is no object is refused for that.
+        let Some(entry) = info.and_then(|info| registry::find(info.group, info.plural)) else {
+            continue;
+        };
+        let namespace = text("/metadata/namespace").unwrap_or(DEFAULT).to_owned();
+        let namespace = entry.info.namespaced.then_some(namespace);
+        let name = text("/metadata/name").map(str::to_owned);
+        let target = Object { entry, namespace, name, subresource: None };
+        asker.needs(&auth::of_object(Verb::Get, &target))?;
+    }
+    Ok(())
+}
 
 /// A task that would be created: where in the list, its name, what it asks for.
 struct Asking {
@@ -26,13 +51,14 @@ struct Asking {
 }
 
 pub(super) async fn check(call: Call) -> Answer {
-    let Call { context, request, .. } = call;
+    let Call { context, request, asker, .. } = call;
     let (parts, body) = request.into_parts();
     let body = body::json(&parts.headers, body).await?;
     let objects = body.get("objects").and_then(Value::as_array);
     let objects =
         objects.ok_or_else(|| Failure::bad_request("the body must be {\"objects\": […]}"))?;
     body::check_count(objects.len())?;
+    may_read(&asker, objects)?;
     let mut refusals: Vec<(usize, Value)> = Vec::new();
     for (namespace, asking) in new_tasks(&context, objects)? {
         let Some(quota) = quota_of(&context, objects, &namespace) else { continue };

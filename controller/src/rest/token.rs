@@ -51,12 +51,32 @@ struct Record {
     used: u32,
 }
 
+/// What tokens of both sorts have of an object's metadata.
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(rename_all = "camelCase")]
-struct Metadata {
+pub(super) struct Metadata {
     name: String,
     uid: String,
     creation_timestamp: String,
+}
+
+impl Metadata {
+    pub(super) fn new(context: &Context, id: &str) -> Self {
+        Self {
+            name: id.to_owned(),
+            uid: uuid::Uuid::new_v4().to_string(),
+            creation_timestamp: context.stamp(),
+        }
+    }
+
+    pub(super) fn public(&self, stored: &Stored) -> Value {
+        json!({
+            "name": self.name,
+            "uid": self.uid,
+            "creationTimestamp": self.creation_timestamp,
+            "resourceVersion": stored.revision.to_string(),
+        })
+    }
 }
 
 #[derive(Debug, Default, Deserialize)]
@@ -147,11 +167,7 @@ pub async fn make(context: &Context, spec: TokenSpec) -> Result<NewlyMade, Failu
     let expires = context.clock.now() + SignedDuration::from_secs(ttl);
     let (id, secret) = (hex(&random::<5>()?), hex(&random::<32>()?));
     let record = Record {
-        metadata: Metadata {
-            name: id.clone(),
-            uid: uuid::Uuid::new_v4().to_string(),
-            creation_timestamp: context.stamp(),
-        },
+        metadata: Metadata::new(context, &id),
         spec,
         secret_sha256: hash(&secret),
         expires,
@@ -234,22 +250,17 @@ fn public(stored: &Stored) -> Option<Value> {
     Some(json!({
         "kind": "JoinToken",
         "apiVersion": muster_api::API_VERSION,
-        "metadata": {
-            "name": record.metadata.name,
-            "uid": record.metadata.uid,
-            "creationTimestamp": record.metadata.creation_timestamp,
-            "resourceVersion": stored.revision.to_string(),
-        },
+        "metadata": record.metadata.public(stored),
         "spec": record.spec,
         "status": {"expires": record.expires, "used": record.used},
     }))
 }
 
-fn hash(secret: &str) -> String {
+pub(super) fn hash(secret: &str) -> String {
     hex(ring::digest::digest(&ring::digest::SHA256, secret.as_bytes()).as_ref())
 }
 
-fn random<const N: usize>() -> Result<[u8; N], Failure> {
+pub(super) fn random<const N: usize>() -> Result<[u8; N], Failure> {
     let mut bytes = [0; N];
     ring::rand::SystemRandom::new()
         .fill(&mut bytes)
@@ -258,7 +269,7 @@ fn random<const N: usize>() -> Result<[u8; N], Failure> {
 }
 
 #[cfg(test)]
-mod tests {
+pub(super) mod tests {
     use std::sync::{Arc, Mutex};
 
     use super::*;
@@ -269,7 +280,13 @@ mod tests {
 
     /// A clock that the test moves.
     #[derive(Debug)]
-    struct Hand(Mutex<Timestamp>);
+    pub(in super::super) struct Hand(Mutex<Timestamp>);
+
+    impl Hand {
+        pub(in super::super) fn advance(&self, seconds: i64) {
+            *self.0.lock().unwrap() += SignedDuration::from_secs(seconds);
+        }
+    }
 
     impl Clock for Hand {
         fn now(&self) -> Timestamp {
@@ -277,7 +294,7 @@ mod tests {
         }
     }
 
-    async fn context(dir: &tempfile::TempDir) -> (Context, Arc<Hand>) {
+    pub(in super::super) async fn context(dir: &tempfile::TempDir) -> (Context, Arc<Hand>) {
         let clock = Arc::new(Hand(Mutex::new("2026-11-22T12:00:00Z".parse().unwrap())));
         let pki = Pki::open(dir.path(), clock.now()).unwrap();
         let config = Config {
@@ -303,9 +320,9 @@ mod tests {
         let spec = TokenSpec { ttl_seconds: Some(60), ..TokenSpec::default() };
         let made = make(&context, spec).await.unwrap();
         spend(&context, &made.token, "a", false).await.unwrap();
-        *clock.0.lock().unwrap() += SignedDuration::from_secs(59);
+        clock.advance(59);
         spend(&context, &made.token, "b", false).await.unwrap();
-        *clock.0.lock().unwrap() += SignedDuration::from_secs(1);
+        clock.advance(1);
         let refused = spend(&context, &made.token, "c", false).await.unwrap_err();
         assert_eq!(refused.code(), 401);
         assert!(refused.message().contains("expired at 2026-11-22T12:01:00Z"), "{refused:?}");

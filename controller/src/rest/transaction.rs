@@ -22,6 +22,7 @@ use super::path::{Object, Verb};
 use super::registry::{self, Entry, View};
 use super::update::{self, Options};
 use super::{Answer, Call, body};
+use crate::auth::{self, Asker};
 use crate::context::Context;
 use crate::objects::{self, LEASES, NODES, QUOTAS, SITES, TASKS};
 use crate::quota::Pass;
@@ -98,7 +99,7 @@ pub(super) async fn transaction(call: Call) -> Answer {
             "a transaction has no dry run; each of its objects has one",
         ));
     }
-    let Call { context, request, .. } = call;
+    let Call { context, request, asker, .. } = call;
     let (parts, body) = request.into_parts();
     let body = body::json(&parts.headers, body).await?;
     let body: Body = serde_json::from_value(body)
@@ -108,7 +109,7 @@ pub(super) async fn transaction(call: Call) -> Answer {
         .parse()
         .map_err(|_| Failure::bad_request(format!("revision {:?} is no number", body.revision)))?;
     body::check_count(body.requests.len())?;
-    let mut work = Work::new(&context, options, revision, &body.requests);
+    let mut work = Work::new((&context, &asker), options, revision, &body.requests);
     let refusals = work.take_all(&body.requests);
     if !refusals.is_empty() {
         let told = |(index, failure): (usize, Failure)| json!({ "index": index, "status": failure.status() });
@@ -139,6 +140,8 @@ pub(super) async fn transaction(call: Call) -> Answer {
 
 struct Work<'a> {
     context: &'a Context,
+    /// Who has to be allowed each of the requests.
+    asker: &'a Asker,
     options: Options,
     /// What the requests create, each as it was sent.
     created: Vec<Value>,
@@ -151,7 +154,12 @@ struct Work<'a> {
 }
 
 impl<'a> Work<'a> {
-    fn new(context: &'a Context, options: Options, revision: u64, requests: &[Request]) -> Self {
+    fn new(
+        (context, asker): (&'a Context, &'a Asker),
+        options: Options,
+        revision: u64,
+        requests: &[Request],
+    ) -> Self {
         let created = |request: &Request| match request {
             Request::Create(object) => Some(object.clone()),
             Request::Patch(_) | Request::Check(_) => None,
@@ -161,6 +169,7 @@ impl<'a> Work<'a> {
         let name = |object: &Value| object["metadata"]["name"].as_str().map(str::to_owned);
         Work {
             context,
+            asker,
             options,
             namespaces: namespaces.filter_map(name).collect(),
             created,
@@ -206,7 +215,7 @@ impl<'a> Work<'a> {
             namespace: text("/metadata/namespace").map(str::to_owned),
             name: text("/metadata/name").unwrap_or_default().to_owned(),
         };
-        let target = target(&named, Verb::Create)?;
+        let target = self.target(&named, Verb::Create)?;
         let (entry, namespace) = (target.entry, target.namespace.as_deref());
         let with = With { objects: &self.created };
         let object = create::prepare_with(self.context, entry, namespace, object.clone(), with)?;
@@ -222,7 +231,7 @@ impl<'a> Work<'a> {
     }
 
     fn patch(&mut self, patch: &Patch) -> Result<Done, Failure> {
-        let target = target(&patch.of, Verb::Patch)?;
+        let target = self.target(&patch.of, Verb::Patch)?;
         if patch.patch.pointer("/metadata/resourceVersion").is_none_or(|v| !v.is_string()) {
             return Err(Failure::bad_request("the patch must say of which resourceVersion it is"));
         }
@@ -242,8 +251,15 @@ impl<'a> Work<'a> {
         }
     }
 
+    /// The object of a request, when its kind takes the verb and the client may.
+    fn target(&self, named: &Named, verb: Verb) -> Result<Object, Failure> {
+        let target = target(named, verb)?;
+        self.asker.needs(&auth::of_object(verb, &target))?;
+        Ok(target)
+    }
+
     fn check(&mut self, check: &Check) -> Result<Done, Failure> {
-        let target = target(&check.of, Verb::Get)?;
+        let target = self.target(&check.of, Verb::Get)?;
         let key = target.key()?;
         let present = self.context.store.get(&key);
         let same = present.filter(|p| p.revision.to_string() == check.resource_version);

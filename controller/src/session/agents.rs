@@ -14,6 +14,7 @@ use std::time::Duration;
 
 use futures::{Stream, StreamExt as _, future};
 use muster_api::id::{Incarnation, TaskUid};
+use muster_api::kind::lease::{DEFAULT_GROUP, Lease};
 use muster_api::name::NodeName;
 use muster_api::pose::Pose;
 use muster_api::wire::agent::v1 as wire;
@@ -32,8 +33,7 @@ use super::nodes::{self, Speaker};
 use super::poses::LivePoses;
 use super::proto::agent_service_server::AgentService;
 use super::strays::lives;
-use super::{Connection, NodeUsage, Sessions, relay, reports};
-use crate::auth::Identity;
+use super::{Connection, NodeUsage, Sessions, agent_of, relay, reports};
 use crate::context::Context;
 use crate::objects;
 use crate::reconcile::images;
@@ -107,7 +107,7 @@ impl AgentService for Agents {
         &self,
         request: Request<Streaming<wire::AgentMessage>>,
     ) -> Result<Response<Self::SessionStream>, Status> {
-        let (node, key) = peer(&request)?;
+        let (node, key) = agent_of(&request)?;
         let outbound = self.begin(node, key, Box::pin(request.into_inner()));
         Ok(Response::new(Box::pin(outbound)))
     }
@@ -116,11 +116,15 @@ impl AgentService for Agents {
         &self,
         request: Request<wire::OrdersRequest>,
     ) -> Result<Response<Self::OrdersStream>, Status> {
-        let (node, key) = peer(&request)?;
+        let (node, key) = agent_of(&request)?;
         // Followed before it is read: what changes in between is told.
         let told = self.sessions.orders().follow(&node);
         let (stored, object) =
             nodes::admit(&self.context, &node, &key).map_err(|error| status(&error))?;
+        let lease = self.context.store.get(&objects::lease_key(node.as_str(), DEFAULT_GROUP));
+        if let Some((lease, stored)) = lease.and_then(|s| Some((objects::read::<Lease>(&s)?, s))) {
+            self.sessions.orders().tell_lease(&lease, stored.revision);
+        }
         self.sessions.orders().say(&node, stored.revision, node_order(&object.spec));
         let told = WatchStream::new(told).filter(|told| future::ready(told.revision > 0));
         let told = told.map(|told| Ok(told.order));
@@ -132,7 +136,7 @@ impl AgentService for Agents {
         &self,
         request: Request<Streaming<wire::Message>>,
     ) -> Result<Response<Self::MessagesStream>, Status> {
-        let (node, key) = peer(&request)?;
+        let (node, key) = agent_of(&request)?;
         nodes::admit(&self.context, &node, &key).map_err(|error| status(&error))?;
         let connection = self.sessions.connection(&node);
         let connection = connection.ok_or_else(|| {
@@ -164,16 +168,6 @@ async fn hear_messages(
         if let Some(live) = context.live() {
             live.frameworks.take_from_executor(&node, message);
         }
-    }
-}
-
-/// The node of the client's certificate, and its key.
-fn peer<T>(request: &Request<T>) -> Result<(NodeName, String), Status> {
-    match request.extensions().get::<Identity>() {
-        Some(Identity::Node { name, key }) => NodeName::new(name.clone())
-            .map(|name| (name, key.clone()))
-            .map_err(|e| Status::unauthenticated(format!("the certificate's name {e}"))),
-        _ => Err(Status::unauthenticated("a node's client certificate is needed")),
     }
 }
 
@@ -491,6 +485,7 @@ impl Session {
         state: Option<&wire::NodeState>,
     ) -> Result<(), End> {
         let state = state.ok_or_else(|| Status::invalid_argument("hello.state is missing"))?;
+        self.sessions.set_person_epoch(&self.node, state.person_epoch);
         let mut report =
             NodeReport::try_from(state).map_err(|e| Status::invalid_argument(e.to_string()))?;
         // The Node is written for the rest of the report anyway, so what counts is written with it.

@@ -27,9 +27,8 @@ use tonic::{Request, Response, Status, Streaming};
 use wire::exec_input::Body as ToAgent;
 use wire::exec_output::Body as FromAgent;
 
-use super::Sessions;
 use super::proto::exec_service_server::ExecService;
-use crate::auth::Identity;
+use super::{Sessions, agent_of};
 
 /// Streams at once, of all nodes: each may hold a window in both directions, half a mebibyte.
 const MOST: usize = 256;
@@ -349,12 +348,7 @@ impl ExecService for Service {
         &self,
         request: Request<Streaming<wire::ExecOutput>>,
     ) -> Result<Response<Self::ExecStream>, Status> {
-        let node = match request.extensions().get::<Identity>() {
-            Some(Identity::Node { name, .. }) => NodeName::new(name.clone()),
-            _ => return Err(Status::unauthenticated("a node's client certificate is needed")),
-        };
-        let node =
-            node.map_err(|e| Status::unauthenticated(format!("the certificate's name {e}")))?;
+        let (node, _) = agent_of(&request)?;
         let input = self.0.begin(&node, request.into_inner()).await?;
         Ok(Response::new(Box::pin(input)))
     }

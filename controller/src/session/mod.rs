@@ -38,12 +38,18 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
+use muster_api::id::Epoch;
 use muster_api::name::NodeName;
 use muster_api::wire::agent::v1 as wire;
+use muster_controller_core::access::{Who, decide};
 use muster_controller_core::node_health::{DETECT_AFTER, Monotonic, NodeHealth};
 use tokio::sync::{Notify, RwLock, RwLockReadGuard, RwLockWriteGuard, mpsc, watch};
 use tokio::time::Instant;
 
+use tonic::{Request, Status};
+
+use crate::auth::{self, Identity};
+use crate::rest::failure::Failure;
 use board::Board;
 use orders::Orders;
 
@@ -51,6 +57,27 @@ use orders::Orders;
 #[allow(clippy::all, clippy::allow_attributes, unreachable_pub, reason = "generated")]
 pub(crate) mod proto {
     include!(concat!(env!("OUT_DIR"), "/muster.agent.v1.rs"));
+}
+
+/// The node for which the client's certificate speaks, and its key.
+fn agent_of<T>(request: &Request<T>) -> Result<(NodeName, String), Status> {
+    let Some(Identity::Node { name, key }) = request.extensions().get::<Identity>() else {
+        return Err(Status::unauthenticated("a node's client certificate is needed"));
+    };
+    let who = Who::Node(name.clone());
+    let asked = auth::stream(("nodes", "session"), None, Some(name));
+    decide(&who, &asked).map_err(|denied| Status::permission_denied(denied.to_string()))?;
+    let node = NodeName::new(name.clone())
+        .map_err(|error| Status::unauthenticated(format!("the certificate's name {error}")))?;
+    Ok((node, key.clone()))
+}
+
+/// A refusal of a stream.
+fn status_of(failure: &Failure) -> Status {
+    match failure.code() {
+        401 => Status::unauthenticated(failure.message()),
+        _ => Status::permission_denied(failure.message()),
+    }
 }
 
 /// What tasks and nodes use now, as the last heartbeats said.
@@ -98,6 +125,8 @@ pub struct Sessions {
     health: Mutex<NodeHealth>,
     health_changed: Notify,
     usage: Mutex<UsageTable>,
+    /// The person's grant that counts at each robot's gate; none: no person's does.
+    persons: watch::Sender<HashMap<NodeName, u64>>,
     started: Instant,
 }
 
@@ -111,6 +140,7 @@ impl Default for Sessions {
             health: Mutex::new(NodeHealth::new(DETECT_AFTER)),
             health_changed: Notify::new(),
             usage: Mutex::default(),
+            persons: watch::Sender::default(),
             started: Instant::now(),
         }
     }
@@ -182,6 +212,21 @@ impl Sessions {
 
     pub(crate) fn set_usage(&self, node: &NodeName, usage: NodeUsage) {
         lock(&self.usage).insert(node.clone(), usage);
+    }
+
+    /// What an agent says of its gate.
+    fn set_person_epoch(&self, node: &NodeName, epoch: u64) {
+        self.persons.send_if_modified(|persons| match epoch {
+            0 => persons.remove(node).is_some(),
+            epoch => persons.insert(node.clone(), epoch) != Some(epoch),
+        });
+    }
+
+    /// Returns when the robot's gate counts this grant to a person, so that nobody else drives. Cancel safe.
+    pub(crate) async fn person_counts(&self, node: &NodeName, epoch: Epoch) {
+        let counts = |persons: &HashMap<NodeName, u64>| persons.get(node) == Some(&epoch.0);
+        // Closed: never, this holds its sender.
+        let _ = self.persons.subscribe().wait_for(counts).await;
     }
 
     pub(crate) fn connection(&self, node: &NodeName) -> Option<Connection> {

@@ -1,10 +1,12 @@
 //! Certificates, join tokens, and who may do what.
 
+use muster_api::wire::agent::v1::TaskPhase::{Failed, Running};
 use muster_controller::app;
 use muster_controller::config::Config;
 use rcgen::{CertificateParams, KeyPair};
 use serde_json::{Value, json};
 
+use super::agent;
 use super::support::*;
 
 fn request() -> (String, KeyPair) {
@@ -116,5 +118,51 @@ async fn a_second_controller_on_the_same_directory_is_refused() {
     };
     let refused = app::start(config).await.unwrap_err();
     assert!(matches!(refused, app::AppError::Locked { .. }), "{refused}");
+    cluster.running.shut_down().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn an_agent_tells_of_its_own_tasks_and_of_no_other_node() {
+    let cluster = Cluster::start().await;
+    let admin = cluster.admin().await;
+    let mut drives = task("patrol");
+    drives["spec"]["placement"] = json!({"node": "r1"});
+    let own = agent::join(&cluster, "r1").await;
+    let mut first = agent::Session::open(&cluster, &own, Vec::new()).await.unwrap();
+    let (_, made) = send(&admin, "POST", TASKS, drives).await;
+    let uid = made["metadata"]["uid"].as_str().unwrap();
+    first.assigned(uid).await;
+    first.say(agent::report(uid, 2, Running)).await;
+    let path = format!("{TASKS}/patrol");
+    cluster.until(&path, |task| task["status"]["phase"] == "Running").await;
+
+    // Another node's agent says that it has ended, in its Hello and after it.
+    let other = agent::join(&cluster, "r2").await;
+    let lie = agent::report(uid, 9, Failed);
+    let mut second = agent::Session::open(&cluster, &other, vec![lie.clone()]).await.unwrap();
+    second.assignments().await.unwrap();
+    second.say(lie).await;
+    // What it says next is taken in, and so the lie was.
+    let (_, made) = send(&admin, "POST", TASKS, {
+        let mut task = task("own");
+        task["spec"]["placement"] = json!({"node": "r2"});
+        task
+    })
+    .await;
+    let its = made["metadata"]["uid"].as_str().unwrap();
+    second.assigned(its).await;
+    second.say(agent::report(its, 2, Running)).await;
+    cluster.until(&format!("{TASKS}/own"), |task| task["status"]["phase"] == "Running").await;
+    assert_eq!(get(&admin, &path).await.1["status"]["phase"], "Running");
+
+    // Nor does it speak for the other node.
+    let mut thief = agent::join(&cluster, "r3").await;
+    thief.node = "r1".to_owned();
+    let refused = match agent::Session::open(&cluster, &thief, Vec::new()).await {
+        Err(refused) => refused,
+        Ok(mut session) => session.assignments().await.unwrap_err(),
+    };
+    let codes = [tonic::Code::PermissionDenied, tonic::Code::InvalidArgument];
+    assert!(codes.contains(&refused.code()), "{refused}");
     cluster.running.shut_down().await.unwrap();
 }

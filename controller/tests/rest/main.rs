@@ -3,10 +3,12 @@
 
 mod access;
 mod agent;
+mod audit;
 mod config;
 mod dependencies;
 mod fencing;
 mod fleet;
+mod frameworks;
 mod limits;
 mod objects;
 mod overload;
@@ -15,7 +17,9 @@ mod quotas;
 mod radius;
 mod removal;
 mod reschedule;
+mod roles;
 mod support;
+mod tokens;
 mod transaction;
 mod views;
 mod watching;

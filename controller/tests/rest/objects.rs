@@ -298,12 +298,16 @@ async fn discovery_tells_what_there_is() {
     assert_eq!(
         named,
         [
+            "accesses",
             "applications",
             "applications/status",
             "frameworks",
             "frameworks/status",
             "leases",
+            "leases/acquire",
+            "leases/return",
             "leases/status",
+            "leases/take",
             "nodes",
             "nodes/fence",
             "nodes/status",

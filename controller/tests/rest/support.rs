@@ -79,6 +79,42 @@ impl Cluster {
         Client::try_from(config).unwrap()
     }
 
+    /// A token of this user, who is in the group `lab` by it.
+    pub(crate) async fn token(&self, user: &str, seconds: u64) -> Value {
+        let spec = json!({"spec": {"user": user, "groups": ["lab"], "ttlSeconds": seconds}});
+        let admin = self.admin().await;
+        let (code, made) = send(&admin, "POST", &format!("{G}/usertokens"), spec).await;
+        assert_eq!(code, 201, "{made}");
+        made
+    }
+
+    /// A client with a token of this user.
+    pub(crate) async fn user(&self, user: &str) -> Client {
+        let made = self.token(user, 3600).await;
+        self.bearer(made["status"]["token"].as_str().unwrap()).await
+    }
+
+    /// A client that shows this token.
+    pub(crate) async fn bearer(&self, token: &str) -> Client {
+        let mut config = self.config().await;
+        config.auth_info = serde_json::from_value(json!({ "token": token })).unwrap();
+        Client::try_from(config).unwrap()
+    }
+
+    /// A client with the certificate of a node's agent, which joins.
+    pub(crate) async fn agent(&self, node: &str) -> Client {
+        let admin = self.admin().await;
+        let (_, made) = send(&admin, "POST", &format!("{G}/jointokens"), Value::Null).await;
+        let key = rcgen::KeyPair::generate().unwrap();
+        let csr = rcgen::CertificateParams::default().serialize_request(&key).unwrap();
+        let ask = json!({"token": made["status"]["token"], "nodeName": node, "kind": "Robot",
+            "csr": csr.pem().unwrap()});
+        let (code, joined) = send(&self.anonymous().await, "POST", &format!("{G}/join"), ask).await;
+        assert_eq!(code, 200, "{joined}");
+        let certificate = joined["certificate"].as_str().unwrap();
+        self.holder(certificate, &key.serialize_pem()).await
+    }
+
     /// A client with a certificate of its own.
     pub(crate) async fn holder(&self, certificate: &str, key: &str) -> Client {
         use base64::Engine as _;

@@ -12,12 +12,12 @@ use serde_json::json;
 use crate::cli::muster;
 
 /// A robot whose driver writes down what it hears.
-struct Robot {
+pub(crate) struct Robot {
     heard: PathBuf,
 }
 
 impl Robot {
-    async fn join(cluster: &mut Cluster) -> Robot {
+    pub(crate) async fn join(cluster: &mut Cluster) -> Robot {
         let (heard, config) = (cluster.dir().join("heard"), cluster.dir().join("agent.yaml"));
         let gate = json!({"gate": {"drivers": [{
             "actuators": ["base:Drive", "arm:Grasp"],
@@ -31,13 +31,13 @@ impl Robot {
         Robot { heard }
     }
 
-    fn heard(&self) -> Vec<String> {
+    pub(crate) fn heard(&self) -> Vec<String> {
         let text = std::fs::read_to_string(&self.heard).unwrap_or_default();
         text.lines().map(str::to_owned).collect()
     }
 
     /// Waits until the newest word of the driver's is this.
-    async fn wait(&self, word: &str) {
+    pub(crate) async fn wait(&self, word: &str) {
         let last = async || match self.heard().pop() {
             Some(last) if last == word => Ok(()),
             last => Err(format!("{last:?}")),
@@ -46,7 +46,7 @@ impl Robot {
     }
 }
 
-fn drive() -> serde_json::Value {
+pub(crate) fn drive() -> serde_json::Value {
     let program = concat!(env!("CARGO_MANIFEST_DIR"), "/frameworks/drive.py");
     json!({
         "resources": {"actuators": ["base:Drive"]},
@@ -55,7 +55,7 @@ fn drive() -> serde_json::Value {
     })
 }
 
-async fn condition(cluster: &Cluster, name: &str, status: &str) -> String {
+pub(crate) async fn condition(cluster: &Cluster, name: &str, status: &str) -> String {
     let found = |node: Option<&Node>| {
         let conditions = &node?.status.as_ref()?.conditions;
         let found = conditions.iter().find(|c| c.r#type == name)?;

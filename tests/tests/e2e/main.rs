@@ -1,5 +1,6 @@
 //! The main job with real processes, cgroups, SQLite and Docker.
 
+mod access;
 mod cli;
 mod config;
 mod demo;
@@ -15,6 +16,7 @@ mod lease;
 mod lines;
 mod messages;
 mod missions;
+mod person;
 mod poses;
 mod preemption;
 mod probes;

@@ -6,3 +6,4 @@ mod clients;
 mod python;
 mod redact;
 mod script;
+mod token;

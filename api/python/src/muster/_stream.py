@@ -95,7 +95,8 @@ class Stream:
         session = self._channel.stream_stream(
             _METHOD, request_serializer=pb.Call.SerializeToString, response_deserializer=pb.Event.FromString
         )
-        self._call: Optional[Any] = session(calls)
+        metadata = (("authorization", f"Bearer {target.token}"),) if target.token else None
+        self._call: Optional[Any] = session(calls, metadata=metadata)
         self.watch = Watch(connect_seconds, self.cancel)
 
     def __iter__(self) -> Iterator[pb.Event]:

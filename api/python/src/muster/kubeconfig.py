@@ -16,8 +16,8 @@ from muster.errors import ConfigError
 AnyPath = Union[str, "os.PathLike[str]"]
 
 _DEFAULT_HTTPS_PORT = 443
-#: What somebody may have put there in place of a certificate, and no framework may use.
-_OTHER_CREDENTIALS = ("token", "tokenFile", "username", "password", "exec", "auth-provider")
+#: What somebody may have put there in place of a certificate or a token, and no framework may use.
+_OTHER_CREDENTIALS = ("tokenFile", "username", "password", "exec", "auth-provider")
 
 
 @dataclass(frozen=True)
@@ -27,11 +27,14 @@ class Target:
     #: ``host:port``, with brackets around an IPv6 address.
     address: str
     certificate_authority: bytes
-    client_certificate: bytes
-    client_key: bytes = field(repr=False)
+    #: None: the token says who asks.
+    client_certificate: Optional[bytes]
+    client_key: Optional[bytes] = field(repr=False)
     namespace: str
     #: The name in the server's certificate, when it is not the host.
     server_name: Optional[str] = None
+    #: Of a user (``muster token create --user``). It counts before a certificate.
+    token: Optional[str] = field(default=None, repr=False)
 
 
 def files(explicit: Optional[AnyPath], environ: Mapping[str, str]) -> list[Path]:
@@ -99,17 +102,20 @@ def _target(config: dict[str, Any]) -> Target:
     user = _entry(config, "users", context.get("user"), "the context's user")
     if cluster.get("insecure-skip-tls-verify") in ("true", True):
         raise _Wrong("insecure-skip-tls-verify: a framework does not talk to a controller that it cannot know")
-    if not (user.get("client-certificate-data") or user.get("client-certificate")):
+    token = user.get("token") or None
+    certified = bool(user.get("client-certificate-data") or user.get("client-certificate"))
+    if not (certified or token):
         other = next((name for name in _OTHER_CREDENTIALS if name in user), None)
         hint = f", and {other} is not enough for a session" if other else ""
-        raise _Wrong(f"the user has no client certificate{hint}")
+        raise _Wrong(f"the user has no client certificate and no token{hint}")
     return Target(
         address=_address(cluster.get("server")),
         certificate_authority=_pem(cluster, "certificate-authority"),
-        client_certificate=_pem(user, "client-certificate"),
-        client_key=_pem(user, "client-key"),
+        client_certificate=_pem(user, "client-certificate") if certified else None,
+        client_key=_pem(user, "client-key") if certified else None,
         namespace=context.get("namespace") or "default",
         server_name=cluster.get("tls-server-name"),
+        token=token,
     )
 
 

@@ -12,6 +12,8 @@ use base64::engine::general_purpose::STANDARD;
 use http::Uri;
 use rustls::ClientConfig;
 use serde::Deserialize;
+use tonic::Request;
+use tonic::metadata::{Ascii, MetadataValue};
 
 use super::tls;
 use crate::KubeconfigError;
@@ -54,19 +56,45 @@ pub(crate) struct Target {
     /// The context's.
     pub(crate) namespace: Option<String>,
     ca: Vec<u8>,
-    certificate: Vec<u8>,
-    key: Vec<u8>,
+    /// Certificate and key; none: the token says who asks.
+    pair: Option<Pair>,
+    /// What is sent with each call; it counts before a certificate.
+    pub(crate) authorization: Option<Authorization>,
+}
+
+/// A certificate and its key, PEM.
+type Pair = (Vec<u8>, Vec<u8>);
+
+/// `Bearer TOKEN`, and no log shows it.
+pub(crate) type Authorization = MetadataValue<Ascii>;
+
+/// A request in somebody's name.
+pub(crate) fn authorized<T>(message: T, authorization: Option<&Authorization>) -> Request<T> {
+    let mut request = Request::new(message);
+    if let Some(authorization) = authorization {
+        request.metadata_mut().insert("authorization", authorization.clone());
+    }
+    request
 }
 
 impl Target {
     /// TLS with the credentials of the kubeconfig.
     pub(crate) fn tls(&self) -> Result<ClientConfig, rustls::Error> {
-        tls::mutual(&self.ca, &self.certificate, &self.key)
+        tls::mutual(&self.ca, self.pair())
     }
 
     /// The same, for agents that are dialled directly.
     pub(crate) fn direct_tls(&self) -> Result<ClientConfig, rustls::Error> {
-        tls::direct(&self.ca, &self.certificate, &self.key)
+        tls::direct(&self.ca, self.pair())
+    }
+
+    /// Whether agents can be dialled: they ask for a certificate.
+    pub(crate) fn has_certificate(&self) -> bool {
+        self.pair.is_some()
+    }
+
+    fn pair(&self) -> Option<(&[u8], &[u8])> {
+        self.pair.as_ref().map(|(certificate, key)| (&certificate[..], &key[..]))
     }
 }
 
@@ -112,6 +140,7 @@ struct User {
     client_certificate_data: Option<String>,
     client_key: Option<PathBuf>,
     client_key_data: Option<String>,
+    token: Option<String>,
 }
 
 #[derive(Debug, Deserialize)]
@@ -206,13 +235,27 @@ fn target(file: File) -> Result<Target, KubeconfigError> {
             cluster.certificate_authority_data,
             cluster.certificate_authority,
         )?,
-        certificate: data(
-            "client-certificate",
-            user.client_certificate_data,
-            user.client_certificate,
-        )?,
-        key: data("client-key", user.client_key_data, user.client_key)?,
+        authorization: user.token.as_deref().map(authorization).transpose()?,
+        pair: pair(user)?,
     })
+}
+
+fn authorization(token: &str) -> Result<Authorization, KubeconfigError> {
+    let value = format!("Bearer {}", token.trim());
+    let mut value = Authorization::try_from(value).map_err(|_| KubeconfigError::Token)?;
+    value.set_sensitive(true);
+    Ok(value)
+}
+
+/// Certificate and key. Who has a token needs none.
+fn pair(user: User) -> Result<Option<Pair>, KubeconfigError> {
+    let none = user.client_certificate_data.is_none() && user.client_certificate.is_none();
+    if none && user.token.is_some() {
+        return Ok(None);
+    }
+    let certificate =
+        data("client-certificate", user.client_certificate_data, user.client_certificate)?;
+    Ok(Some((certificate, data("client-key", user.client_key_data, user.client_key)?)))
 }
 
 fn data(
@@ -266,11 +309,37 @@ contexts: [{{name: hall, context: {{cluster: hall, user: u, namespace: team}}}}]
         let target = load(&files).expect("usable");
         assert_eq!(target.address.to_string(), "[::1]:1");
         assert_eq!(target.namespace.as_deref(), Some("team"));
-        assert_eq!((&*target.ca, &*target.certificate), (&b"the CA"[..], &b"the certificate"[..]));
-        assert_eq!(target.key, b"the key");
+        let (certificate, key) = target.pair.expect("both");
+        assert_eq!((&*target.ca, &*certificate), (&b"the CA"[..], &b"the certificate"[..]));
+        assert_eq!(key, b"the key");
+        assert!(target.authorization.is_none());
         let error = load(&files[..1]).err().expect("there is no context");
         assert_eq!(error.to_string(), r#"the kubeconfig has no context "hall""#);
         assert!(matches!(load(&files[1..2]), Err(KubeconfigError::Read { .. })));
+    }
+
+    #[test]
+    fn a_token_stands_for_a_certificate() {
+        let dir = tempfile::tempdir().expect("a directory");
+        let path = dir.path().join("config");
+        let load_with = |user: &str| {
+            let text = format!(
+                "clusters: [{{name: c, cluster: {{server: 'https://h', certificate-authority-data: Y2E=}}}}]
+users: [{{name: u, user: {{{user}}}}}]
+contexts: [{{name: x, context: {{cluster: c, user: u}}}}]
+current-context: x
+"
+            );
+            std::fs::write(&path, text).expect("written");
+            load(std::slice::from_ref(&path))
+        };
+        let target = load_with("token: musteru1.ab.cd").expect("good");
+        assert!(!target.has_certificate());
+        let request = authorized((), target.authorization.as_ref());
+        assert_eq!(request.metadata().get("authorization").expect("sent"), "Bearer musteru1.ab.cd");
+        assert!(!format!("{request:?}").contains("musteru1"), "tokens do not get into logs");
+        assert!(matches!(load_with("token: \"a\\nb\""), Err(KubeconfigError::Token)));
+        assert!(matches!(load_with(""), Err(KubeconfigError::Missing(_))));
     }
 
     #[test]

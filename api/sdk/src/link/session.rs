@@ -22,7 +22,7 @@ use tokio_stream::wrappers::ReceiverStream;
 use tokio_util::sync::CancellationToken;
 
 use super::direct::{Lanes, Outgoing, Relayed};
-use super::kubeconfig::Address;
+use super::kubeconfig::{Address, Authorization, authorized};
 use super::pending::{Answered, Pending};
 use super::seen::{Seen, Verdict};
 use super::state::StateFile;
@@ -104,6 +104,7 @@ impl Drop for Inbox {
 pub(crate) struct Link {
     pub(crate) address: Address,
     pub(crate) tls: Arc<ClientConfig>,
+    pub(crate) authorization: Option<Authorization>,
 }
 
 /// Who the framework is.
@@ -275,7 +276,8 @@ impl Session {
         // The queue is empty: this does not wait.
         drop(out.send(proto::Call { id: String::new(), call: subscribe }).await);
         let first = async {
-            let mut heard = client.session(ReceiverStream::new(queue)).await?.into_inner();
+            let calls = authorized(ReceiverStream::new(queue), self.link.authorization.as_ref());
+            let mut heard = client.session(calls).await?.into_inner();
             let first = heard.message().await?;
             Ok((heard, first))
         };
@@ -332,7 +334,9 @@ impl Session {
         match error.reason.as_str() {
             UNKNOWN if self.pending.torn_down() => End::Final(Final::TornDown),
             // Coming back after Cut would throw the one out that took this one's place, and so on for ever.
-            UNKNOWN | "AlreadyExists" | "Invalid" | "Cut" => End::Final(Final::Refused(error)),
+            UNKNOWN | "AlreadyExists" | "Forbidden" | "Invalid" | "Cut" => {
+                End::Final(Final::Refused(error))
+            }
             _ => End::Broken(Broken::Told(error)),
         }
     }

@@ -21,39 +21,48 @@ use super::kubeconfig::Address;
 /// A connection in one building is up in milliseconds, over a bad radio link in seconds.
 const PATIENCE: Duration = Duration::from_secs(10);
 
+/// Certificate and key, PEM; none: whoever asks says who they are by a token.
+type Pair<'a> = Option<(&'a [u8], &'a [u8])>;
+
 /// For the controller.
-pub(crate) fn mutual(ca: &[u8], certificate: &[u8], key: &[u8]) -> Result<ClientConfig, Error> {
-    config(ring::default_provider(), b"h2", (ca, certificate, key))
+pub(crate) fn mutual(ca: &[u8], pair: Pair<'_>) -> Result<ClientConfig, Error> {
+    config(ring::default_provider(), b"h2", (ca, pair))
 }
 
 /// For agents. Of the ciphers the one with the shorter key comes first: it is as good, and large messages are what these
 /// connections are for.
-pub(crate) fn direct(ca: &[u8], certificate: &[u8], key: &[u8]) -> Result<ClientConfig, Error> {
+pub(crate) fn direct(ca: &[u8], pair: Pair<'_>) -> Result<ClientConfig, Error> {
     let mut provider = ring::default_provider();
     provider
         .cipher_suites
         .sort_by_key(|suite| suite.suite() != CipherSuite::TLS13_AES_128_GCM_SHA256);
-    config(provider, ALPN, (ca, certificate, key))
+    config(provider, ALPN, (ca, pair))
 }
 
-/// Believes the kubeconfig's CA and shows its client certificate.
+/// Believes the kubeconfig's CA and shows its client certificate, where there is one.
 fn config(
     provider: CryptoProvider,
     protocol: &[u8],
-    (ca, certificate, key): (&[u8], &[u8], &[u8]),
+    (ca, pair): (&[u8], Pair<'_>),
 ) -> Result<ClientConfig, Error> {
     let bad = |_| Error::InvalidCertificate(CertificateError::BadEncoding);
     let mut roots = RootCertStore::empty();
     for authority in CertificateDer::pem_slice_iter(ca) {
         roots.add(authority.map_err(bad)?)?;
     }
-    let chain: Vec<CertificateDer<'static>> =
-        CertificateDer::pem_slice_iter(certificate).collect::<Result<_, _>>().map_err(bad)?;
-    let key = PrivateKeyDer::from_pem_slice(key).map_err(bad)?;
-    let mut config = ClientConfig::builder_with_provider(Arc::new(provider))
+    let builder = ClientConfig::builder_with_provider(Arc::new(provider))
         .with_safe_default_protocol_versions()?
-        .with_root_certificates(roots)
-        .with_client_auth_cert(chain, key)?;
+        .with_root_certificates(roots);
+    let mut config = match pair {
+        None => builder.with_no_client_auth(),
+        Some((certificate, key)) => {
+            let chain = CertificateDer::pem_slice_iter(certificate);
+            let chain: Vec<CertificateDer<'static>> =
+                chain.collect::<Result<_, _>>().map_err(bad)?;
+            let key = PrivateKeyDer::from_pem_slice(key).map_err(bad)?;
+            builder.with_client_auth_cert(chain, key)?
+        }
+    };
     config.alpn_protocols = vec![protocol.to_vec()];
     Ok(config)
 }

@@ -1,7 +1,7 @@
 //! A lease: who drives, since when.
 
 use jiff::Timestamp;
-use muster_api::kind::lease::Lease;
+use muster_api::kind::lease::{HolderKind, Lease};
 use muster_api::resource::format_function_list;
 
 use super::{begin, when};
@@ -18,6 +18,9 @@ pub(super) fn describe(sheet: &mut Sheet, lease: &Lease, now: Timestamp) {
     let Some(status) = &lease.status else { return };
     sheet.field("Epoch", status.epoch.to_string());
     match &status.holder {
+        Some(holder) if holder.kind == HolderKind::User => {
+            sheet.field("Holder", holder.to_string());
+        }
         Some(holder) => {
             sheet.field(
                 "Holder",

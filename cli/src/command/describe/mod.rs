@@ -1,6 +1,7 @@
 //! `muster describe`: everything about objects, for people. One file for each kind that has more to
 //! say than its fields.
 
+mod access;
 mod any;
 mod application;
 mod framework;
@@ -122,6 +123,9 @@ async fn describe(
             keyed::secret(&mut sheet, &serde_json::from_value(object).map_err(read)?, now);
         }
         "Lease" => lease::describe(&mut sheet, &serde_json::from_value(object).map_err(read)?, now),
+        "Access" => {
+            access::describe(&mut sheet, &serde_json::from_value(object).map_err(read)?, now);
+        }
         _ => any::describe(&mut sheet, &object, now),
     }
     if info.kind != "Event" {

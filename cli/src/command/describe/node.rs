@@ -150,7 +150,7 @@ fn actuator_table(status: &NodeStatus) -> Table {
         let holder = match lease {
             None => Cell::from("-"),
             Some(lease) => match &lease.holder {
-                Some(h) => format!("{}/{}", h.namespace, h.name).into(),
+                Some(holder) => holder.to_string().into(),
                 None => Cell::new("free", Mood::Good),
             },
         };
@@ -171,7 +171,7 @@ fn actuator_table(status: &NodeStatus) -> Table {
     }
     if only.is_none() {
         for lease in &status.leases {
-            let holder = lease.holder.as_ref().map(|h| format!("{}/{}", h.namespace, h.name));
+            let holder = lease.holder.as_ref().map(ToString::to_string);
             table.push([
                 "(group)".to_owned(),
                 lease.group.clone(),

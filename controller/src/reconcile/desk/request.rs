@@ -13,6 +13,7 @@ use serde_json::Value;
 use tokio::sync::{mpsc, oneshot};
 use tokio_util::sync::CancellationToken;
 
+use crate::auth::Identity;
 use crate::quota::Pass;
 use crate::store::{Key, Op};
 
@@ -134,6 +135,8 @@ pub enum Request {
         uid: FrameworkUid,
         /// The session's number: what comes of it is that session's.
         session: u64,
+        /// Who opened the session.
+        by: Arc<Identity>,
         /// The call's own id, for the Answer.
         call: String,
         /// Which offers it answers.

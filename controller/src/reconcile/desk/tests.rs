@@ -106,6 +106,7 @@ impl Room {
         let request = Request::Accept {
             uid: FRAMEWORK.into(),
             session: 1,
+            by: Arc::new(crate::auth::Identity::Admin { name: "a".to_owned() }),
             call: name.to_owned(),
             offers: vec![offer],
             launches: vec![launch],

@@ -44,7 +44,7 @@ pub(super) async fn open(call: Call, target: Object) -> Answer {
     };
     let ready = live.execs.check(&task);
     let ready = ready.map_err(|error| failure(&error).about(target.entry, &key.name))?;
-    let visit = Visit { who: call.identity.name(), task, ready, asked };
+    let visit = Visit { who: call.asker.identity.name(), task, ready, asked };
     websocket::upgrade(call, visit)
 }
 

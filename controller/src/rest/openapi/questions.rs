@@ -112,6 +112,13 @@ pub(super) fn of_kind(entry: &Entry, one: &str, paths: &mut Map<String, Value>) 
             sub("fence", vec![Operation::post("A person confirms that it is off.", word)]);
             sub("pose", vec![Operation::get("Where it is now.")]);
         }
+        ("Lease", _) => {
+            let why = || object(&[("reason", text())]);
+            let post = |said| vec![Operation::post(said, why())];
+            sub("acquire", post("A person holds it, if nobody does."));
+            sub("take", post("A person holds it, whoever did."));
+            sub("return", post("The person gives it back."));
+        }
         ("TaskSet", _) => {
             let replicas = object(&[("replicas", json!({"type": "integer"}))]);
             let scale = object(&[
@@ -152,6 +159,7 @@ pub(super) fn of_group(group: &ApiGroup, paths: &mut Map<String, Value>) {
         "authorization.k8s.io" => {
             at("selfsubjectaccessreviews", &[], ask("Whether the client may do something."));
             at("selfsubjectrulesreviews", &[], ask("What the client may do."));
+            at("subjectaccessreviews", &[], ask("Whether somebody may do something."));
         }
         "authentication.k8s.io" => at("selfsubjectreviews", &[], ask("Who the client is.")),
         metrics_api::GROUP => {
@@ -185,6 +193,15 @@ pub(super) fn of_group(group: &ApiGroup, paths: &mut Map<String, Value>) {
                 Operation { method: "delete", ..Operation::get("It admits nobody any more.") };
             let one = vec![Operation::get("A join token."), end];
             at("jointokens/{id}", &["id"], one);
+            let groups = json!({"type": "array", "items": text()});
+            let ttl = json!({"type": "integer"});
+            let spec = object(&[("user", text()), ("groups", groups), ("ttlSeconds", ttl)]);
+            let token = Operation::post("A new token of a user.", object(&[("spec", spec)]));
+            at("usertokens", &[], vec![Operation::get("The users' tokens."), token.created()]);
+            let end =
+                Operation { method: "delete", ..Operation::get("It admits nobody any more.") };
+            let one = vec![Operation::get("A token of a user."), end];
+            at("usertokens/{id}", &["id"], one);
         }
         _ => {}
     }

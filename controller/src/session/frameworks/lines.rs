@@ -25,7 +25,7 @@ use tokio_stream::wrappers::ReceiverStream;
 
 use super::session::{self, Wire};
 use super::{Frameworks, MAX_WIRE};
-use crate::auth::Identity;
+use crate::auth::Asker;
 use crate::rest::failure::Failure;
 
 /// Events on their way to the transport.
@@ -41,18 +41,9 @@ pub fn router(frameworks: Arc<Frameworks>) -> Router {
         .with_state(frameworks)
 }
 
-fn admit(request: &Request) -> Result<(), Failure> {
-    match request.extensions().get::<Identity>() {
-        Some(Identity::Admin { .. }) => Ok(()),
-        Some(Identity::Anonymous) | None => {
-            Err(Failure::unauthorized("a client certificate is needed"))
-        }
-        Some(other) => Err(Failure::denied(format!("{} may not run a framework", other.name()))),
-    }
-}
-
 async fn open(State(frameworks): State<Arc<Frameworks>>, request: Request) -> Response {
-    if let Err(failure) = admit(&request) {
+    let asker = Asker::of(&frameworks.context, request.extensions());
+    if let Err(failure) = frameworks.admit(&asker) {
         return failure.into_response();
     }
     let (to_session, calls) = Wire::calls();
@@ -70,7 +61,7 @@ async fn open(State(frameworks): State<Arc<Frameworks>>, request: Request) -> Re
             drop(out.send(wire::Event { event: Some(event) }).await);
         }
     });
-    let wire = Wire { calls, keep_calls: Some(to_session), out };
+    let wire = Wire { asker, calls, keep_calls: Some(to_session), out };
     frameworks.tasks.spawn(session::run(Arc::clone(&frameworks), wire));
     let lines = ReceiverStream::new(events).map(|event| {
         let mut line = serde_json::to_vec(&event).unwrap_or_default();
@@ -85,10 +76,12 @@ async fn call(
     Path(id): Path<String>,
     request: Request,
 ) -> Response {
-    if let Err(failure) = admit(&request) {
+    let asker = Asker::of(&frameworks.context, request.extensions());
+    if let Err(failure) = frameworks.admit(&asker) {
         return failure.into_response();
     }
-    let Some(calls) = frameworks.calls_of(&id) else {
+    // Of somebody else's session nothing is told.
+    let Some(calls) = frameworks.calls_of(&id, &asker.identity) else {
         let text = format!("there is no session {id}; it ended, or it is carried by gRPC");
         return Failure::new(StatusCode::NOT_FOUND, "NotFound", text).into_response();
     };

@@ -41,6 +41,7 @@ use muster_api::kind::task::Task;
 use muster_api::name::NodeName;
 use muster_api::wire::agent::v1::Message as AgentMessage;
 use muster_api::wire::framework::v1 as wire;
+use muster_controller_core::access::{Asked, Who};
 use muster_controller_core::cluster::Executor;
 use tokio::sync::{Notify, mpsc, oneshot};
 use tokio_util::sync::CancellationToken;
@@ -48,10 +49,12 @@ use tokio_util::task::TaskTracker;
 
 use super::lock;
 use super::relay::Lost;
+use crate::auth::{self, Asker, Identity};
 use crate::context::Context;
 use crate::objects;
 use crate::reconcile::desk::{Depth, FrameworkUid, Outlet, Request, View};
 use crate::reconcile::schedule;
+use crate::rest::failure::Failure;
 
 /// The generated server side of the session.
 #[allow(clippy::all, clippy::allow_attributes, unreachable_pub, reason = "generated")]
@@ -120,6 +123,8 @@ struct Spoken {
 #[derive(Debug, Clone)]
 struct Open {
     outlet: Outlet,
+    /// Who opened it.
+    by: Arc<Identity>,
     /// It can dial agents.
     direct: bool,
     mailbox: Arc<Mailbox>,
@@ -127,6 +132,11 @@ struct Open {
     calls: mpsc::Sender<wire::Call>,
     /// Ends it.
     cut: CancellationToken,
+}
+
+/// Running a framework in a namespace.
+fn session_in<'a>(namespace: Option<&'a str>, name: Option<&'a str>) -> Asked<'a> {
+    auth::stream(("frameworks", "session"), namespace, name)
 }
 
 /// Every framework's session.
@@ -340,8 +350,21 @@ impl Frameworks {
         spoken.is_some_and(|spoken| spoken.is_executor)
     }
 
-    fn calls_of(&self, session_id: &str) -> Option<mpsc::Sender<wire::Call>> {
+    /// Whether somebody may run a framework, wherever that is. Its first call says where, and is held to that.
+    fn admit(&self, asker: &Asker) -> Result<(), Failure> {
+        let places = match &asker.who {
+            Who::User(held) => held.iter().map(|grant| grant.namespace.clone()).collect(),
+            Who::Admin | Who::Node(_) | Who::Nobody => Vec::new(),
+        };
+        let may = |place: &Option<String>| asker.may(&session_in(place.as_deref(), None));
+        match places.iter().any(may) {
+            true => Ok(()),
+            false => asker.needs(&session_in(None, None)),
+        }
+    }
+
+    fn calls_of(&self, session_id: &str, who: &Identity) -> Option<mpsc::Sender<wire::Call>> {
         let uid = lock(&self.by_session).get(session_id).cloned()?;
-        lock(&self.open).get(&uid).map(|o| o.calls.clone())
+        lock(&self.open).get(&uid).filter(|open| *open.by == *who).map(|open| open.calls.clone())
     }
 }

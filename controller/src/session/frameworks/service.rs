@@ -12,7 +12,8 @@ use tonic::{Request, Response, Status, Streaming};
 use super::Frameworks;
 use super::proto::framework_service_server::FrameworkService;
 use super::session::{self, Wire};
-use crate::auth::Identity;
+use crate::auth::Asker;
+use crate::session::status_of;
 
 /// Events on their way to the transport; more would only hide that the framework does not read.
 const OUT: usize = 16;
@@ -25,9 +26,12 @@ pub struct Service(pub Arc<Frameworks>);
 pub type Inbound = Pin<Box<dyn Stream<Item = Result<wire::Call, Status>> + Send>>;
 
 impl Frameworks {
-    /// A session with who may run a framework and says this; gives what it is told. Whatever carries the messages keeps
-    /// their order.
-    pub fn begin(self: &Arc<Self>, mut inbound: Inbound) -> ReceiverStream<wire::Event> {
+    /// A session with `asker`, who says this; gives what it is told. Whatever carries the messages keeps their order.
+    pub fn begin(
+        self: &Arc<Self>,
+        asker: Asker,
+        mut inbound: Inbound,
+    ) -> ReceiverStream<wire::Event> {
         let (to_session, calls) = Wire::calls();
         let (out, events) = mpsc::channel(OUT);
         self.tasks.spawn(async move {
@@ -44,7 +48,8 @@ impl Frameworks {
                 }
             }
         });
-        self.tasks.spawn(session::run(Arc::clone(self), Wire { calls, keep_calls: None, out }));
+        self.tasks
+            .spawn(session::run(Arc::clone(self), Wire { asker, calls, keep_calls: None, out }));
         ReceiverStream::new(events)
     }
 }
@@ -57,18 +62,9 @@ impl FrameworkService for Service {
         &self,
         request: Request<Streaming<wire::Call>>,
     ) -> Result<Response<Self::SessionStream>, Status> {
-        // Who may run frameworks: administrators, until there are roles.
-        match request.extensions().get::<Identity>() {
-            Some(Identity::Admin { .. }) => {}
-            Some(Identity::Anonymous) | None => {
-                return Err(Status::unauthenticated("a client certificate is needed"));
-            }
-            Some(other) => {
-                let text = format!("{} may not run a framework", other.name());
-                return Err(Status::permission_denied(text));
-            }
-        }
-        let events = self.0.begin(Box::pin(request.into_inner()));
+        let asker = Asker::of(&self.0.context, request.extensions());
+        self.0.admit(&asker).map_err(|failure| status_of(&failure))?;
+        let events = self.0.begin(asker, Box::pin(request.into_inner()));
         Ok(Response::new(Box::pin(events.map(Ok))))
     }
 }
@@ -97,7 +93,7 @@ mod tests {
         let revive =
             wire::Call { call: Some(call::Call::Revive(wire::Revive {})), ..Default::default() };
         let said = stream::iter([Ok(revive)]).chain(stream::pending());
-        let told = frameworks.begin(Box::pin(said)).collect::<Vec<_>>();
+        let told = frameworks.begin(Asker::admin("a"), Box::pin(said)).collect::<Vec<_>>();
         let told = tokio::time::timeout(Duration::from_secs(60), told).await.expect("it ends");
         let [wire::Event { event: Some(event::Event::Error(error)) }] = &told[..] else {
             panic!("{told:?}")

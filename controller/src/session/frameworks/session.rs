@@ -17,6 +17,7 @@ use muster_api::kind::framework::{ACKNOWLEDGE_FINALIZER, FrameworkSpec};
 use muster_api::kind::task::Task;
 use muster_api::wire::framework::v1 as wire;
 use muster_api::wire::framework_session::{set_filter, set_position};
+use muster_controller_core::access::Verb;
 use muster_controller_core::offer::DEFAULT_REFUSE;
 use tokio::sync::{mpsc, oneshot};
 use tokio::time::{Instant, MissedTickBehavior, interval};
@@ -26,11 +27,14 @@ use wire::event::Event as Tell;
 
 use super::subscribe::{self, Guest};
 use super::{
-    CALLS, EVENTS, Frameworks, HEARTBEAT_EVERY, MAX_MESSAGE, Mailbox, Open, Unsent, convert, launch,
+    CALLS, EVENTS, Frameworks, HEARTBEAT_EVERY, MAX_MESSAGE, Mailbox, Open, Unsent, convert,
+    launch, session_in,
 };
+use crate::audit::Line;
+use crate::auth::{Asker, Identity};
 use crate::objects::{self, TASKS};
 use crate::reconcile::desk::{Outlet, Request};
-use crate::store::{Key, StoreError};
+use crate::store::{Key, StoreError, Stored};
 
 /// How long an update waits for its acknowledgement until it is said again.
 const RESEND: Duration = Duration::from_secs(10);
@@ -41,6 +45,8 @@ const MAX_REFUSE: Duration = Duration::from_secs(365 * 24 * 3600);
 
 /// The transport's ends.
 pub(super) struct Wire {
+    /// Who is there.
+    pub(super) asker: Asker,
     /// Where calls come from, beside those that come by [`Frameworks::calls_of`].
     pub(super) calls: mpsc::Receiver<wire::Call>,
     /// The sender of the same channel, for a transport whose calls come one by one; none: when the framework closes
@@ -63,6 +69,8 @@ struct Closed;
 
 struct Session {
     frameworks: Arc<Frameworks>,
+    /// Who opened it.
+    by: Arc<Identity>,
     guest: Guest,
     number: u64,
     out: mpsc::Sender<wire::Event>,
@@ -82,7 +90,7 @@ pub(super) async fn run(frameworks: Arc<Frameworks>, mut wire: Wire) {
     let Ok(Some(wire::Call { call: Some(Said::Subscribe(subscribe)), .. })) = first else {
         return refuse(&wire.out, "Invalid", "the first call of a session is Subscribe").await;
     };
-    match subscribe::subscribe(&frameworks, &subscribe).await {
+    match subscribe::subscribe(&frameworks, &wire.asker, &subscribe).await {
         Ok(guest) => serve(frameworks, wire, guest).await,
         Err(subscribe::Refused(reason, message)) => refuse(&wire.out, reason, &message).await,
     }
@@ -107,13 +115,15 @@ async fn serve(frameworks: Arc<Frameworks>, wire: Wire, guest: Guest) {
         out: wire.out,
         mailbox: Arc::clone(&mailbox),
         unacknowledged: BTreeMap::new(),
+        by: Arc::new(wire.asker.identity),
         guest,
     };
     let (uid, key) = (Arc::clone(&session.guest.uid), session.guest.key.clone());
     tracing::info!(framework = %key, id = %uid, returned = session.guest.returned, "framework subscribed");
     let calls = wire.keep_calls.unwrap_or_else(|| mpsc::channel(1).0);
     let direct = session.guest.direct;
-    let open = Open { outlet: outlet.clone(), direct, mailbox, calls, cut: cut.clone() };
+    let by = Arc::clone(&session.by);
+    let open = Open { outlet: outlet.clone(), by, direct, mailbox, calls, cut: cut.clone() };
     frameworks.connect(&uid, &session_id, open);
     // After it is taken in: whoever writes that it is away looks first whether it is.
     let written = subscribe::write_connected(&frameworks, &session.guest, number).await;
@@ -268,6 +278,17 @@ impl Session {
         let wire::Call { id, call } = call;
         let uid = Arc::clone(&self.guest.uid);
         let refusal = match call {
+            Some(Said::Accept(_) | Said::Kill(_)) if !self.still_may() => {
+                self.say(Tell::Error(wire::Error {
+                    reason: "Forbidden".to_owned(),
+                    message: "the right to run this framework was taken back".to_owned(),
+                }))
+                .await?;
+                return Err(Closed);
+            }
+            Some(Said::Accept(_) | Said::Kill(_)) if !self.is_audited() => {
+                Some(convert::unavailable())
+            }
             Some(Said::Accept(accept)) => return self.accept(id, &accept).await.map(|()| false),
             Some(Said::SetPosition(new)) => {
                 self.wish(|spec| set_position(spec, new.position.as_ref())).await?
@@ -302,6 +323,22 @@ impl Session {
         };
         self.answer(id, refusal).await?;
         Ok(false)
+    }
+
+    /// Whether who opened the session may run the framework now: a session may last for weeks.
+    fn still_may(&self) -> bool {
+        let key = &self.guest.key;
+        let asked = session_in(key.namespace(), Some(&key.name));
+        Asker::with(&self.frameworks.context, Identity::clone(&self.by)).may(&asked)
+    }
+
+    fn is_audited(&self) -> bool {
+        let context = &self.frameworks.context;
+        let ready = context.audit.ready(context.clock.now());
+        if let Err(error) = &ready {
+            tracing::warn!(error = error as &dyn std::error::Error, framework = %self.guest.key, "nothing is written while the audit log cannot be");
+        }
+        ready.is_ok()
     }
 
     async fn wish(
@@ -355,8 +392,9 @@ impl Session {
             return self.answer(id, Some(invalid("accept.refuseSeconds", "is not a time"))).await;
         };
         let offers = accept.offers.iter().filter_map(|id| launch::parse(id)).collect();
-        let (uid, session) = (Arc::clone(&self.guest.uid), self.number);
-        self.ask(Request::Accept { uid, session, call: id, offers, launches, refuse, guard }).await
+        let (uid, session, by) = (Arc::clone(&self.guest.uid), self.number, Arc::clone(&self.by));
+        self.ask(Request::Accept { uid, session, by, call: id, offers, launches, refuse, guard })
+            .await
     }
 
     /// The key of one of the framework's tasks.
@@ -386,7 +424,7 @@ impl Session {
         };
         let grace = kill.grace_period_seconds.map(i64::from);
         match crate::rest::delete::delete_with_grace(&self.frameworks.context, &key, grace).await {
-            Ok(_) => None,
+            Ok(stored) => self.write_line("tasks", &stored),
             Err(failure) if failure.code() == 404 => None,
             Err(failure) => {
                 tracing::warn!(task = %key, error = failure.message(), "a kill is not written");
@@ -454,13 +492,27 @@ impl Session {
     async fn tear_down(&self) -> Option<wire::Refusal> {
         let context = &self.frameworks.context;
         match crate::rest::delete::delete_object(context, &self.guest.key).await {
-            Ok(_) => None,
+            Ok(stored) => self.write_line("frameworks", &stored),
             Err(failure) if failure.code() == 404 => None,
             Err(failure) => {
                 tracing::warn!(framework = %self.guest.key, error = failure.message(), "a teardown is not written");
                 Some(convert::unavailable())
             }
         }
+    }
+
+    /// The line in the audit log of an object that was ended; a refusal when it is not written.
+    fn write_line(&self, resource: &'static str, ended: &Stored) -> Option<wire::Refusal> {
+        let context = &self.frameworks.context;
+        let line = Line {
+            time: context.clock.now(),
+            namespace: ended.key.namespace().map(str::to_owned),
+            name: Some(ended.key.name.to_string()),
+            uid: Some(ended.uid.to_string()),
+            code: Some(200),
+            ..Line::of(&self.by, Verb::Delete, resource)
+        };
+        context.audit.write(&line).err().map(|_| convert::unavailable())
     }
 
     async fn leave(self, session_id: &str) {

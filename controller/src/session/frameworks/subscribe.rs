@@ -8,8 +8,11 @@ use muster_api::kind::namespace::DEFAULT;
 use muster_api::name::check_name;
 use muster_api::wire::framework::v1 as wire;
 use muster_api::wire::framework_session::spec_from_wire;
+use muster_controller_core::access::Verb;
 
-use super::Frameworks;
+use super::{Frameworks, session_in};
+use crate::audit::Line;
+use crate::auth::Asker;
 use crate::context::Context;
 use crate::objects::{self, FRAMEWORKS};
 use crate::reconcile::desk::FrameworkUid;
@@ -50,6 +53,7 @@ fn invalid(message: impl std::fmt::Display) -> Refused {
 /// What the framework is told before its session ends.
 pub(super) async fn subscribe(
     frameworks: &Frameworks,
+    asker: &Asker,
     call: &wire::Subscribe,
 ) -> Result<Guest, Refused> {
     let context = &frameworks.context;
@@ -62,8 +66,11 @@ pub(super) async fn subscribe(
     }
     let namespace = if call.namespace.is_empty() { DEFAULT } else { &call.namespace };
     let key = Key::namespaced(FRAMEWORKS, namespace, call.name.as_str());
+    asker
+        .needs(&session_in(Some(namespace), Some(&call.name)))
+        .map_err(|failure| Refused("Forbidden", failure.message().to_owned()))?;
     let Some(stored) = context.store.get(&key) else {
-        let registered = register(context, key, spec, call).await?;
+        let registered = register(context, (key, asker), spec, call).await?;
         return Ok(Guest { direct: call.direct, ..registered });
     };
     if stored.mentions("deletionTimestamp") {
@@ -112,7 +119,7 @@ fn gone(id: &str) -> Refused {
 
 async fn register(
     context: &Context,
-    key: Key,
+    (key, asker): (Key, &Asker),
     spec: FrameworkSpec,
     call: &wire::Subscribe,
 ) -> Result<Guest, Refused> {
@@ -134,6 +141,17 @@ async fn register(
         409 => Refused("Unavailable", format!("a framework {} was just registered", key.name)),
         404 | 403 => invalid(failure.message()),
         _ => Refused("Unavailable", failure.message().to_owned()),
+    })?;
+    let line = Line {
+        time: context.clock.now(),
+        namespace: key.namespace().map(str::to_owned),
+        name: Some(key.name.to_string()),
+        uid: Some(stored.uid.to_string()),
+        code: Some(201),
+        ..Line::of(&asker.identity, Verb::Create, "frameworks")
+    };
+    context.audit.write(&line).map_err(|error| {
+        Refused("Unavailable", format!("the audit log cannot be written: {error}"))
     })?;
     let uid: FrameworkUid = (*stored.uid).into();
     Ok(Guest { uid, key, spec, returned: false, direct: false })

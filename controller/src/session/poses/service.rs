@@ -9,13 +9,14 @@ use muster_api::wire::pose_stream::pose_of;
 use muster_controller_core::poses::NotTaken;
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
-use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 use tonic::{Request, Response, Status, Streaming};
 
 use super::LivePoses;
 use super::proto::pose_service_server::PoseService;
-use crate::auth::Identity;
+use crate::auth::{self, Asker};
+use crate::context::Context;
+use crate::session::status_of;
 
 /// Replies that wait for a publisher to read them; more are dropped, because nobody may wait for a publisher.
 const REPLIES: usize = 64;
@@ -23,16 +24,16 @@ const REPLIES: usize = 64;
 /// The service.
 #[derive(Debug, Clone)]
 pub struct Service {
+    context: Arc<Context>,
     poses: Arc<LivePoses>,
     tasks: TaskTracker,
-    stop: CancellationToken,
 }
 
 impl Service {
-    /// A service whose streams run on `tasks` and end with `stop`.
+    /// A service whose streams run on `tasks` and end with `context.stop`.
     #[must_use]
-    pub fn new(poses: Arc<LivePoses>, tasks: TaskTracker, stop: CancellationToken) -> Self {
-        Service { poses, tasks, stop }
+    pub fn new(context: Arc<Context>, poses: Arc<LivePoses>, tasks: TaskTracker) -> Self {
+        Service { context, poses, tasks }
     }
 }
 
@@ -46,19 +47,12 @@ impl PoseService for Service {
         &self,
         request: Request<Streaming<wire::PoseBatch>>,
     ) -> Result<Response<Self::PublishStream>, Status> {
-        // Who may say where other people's robots are: administrators, until there are roles.
-        match request.extensions().get::<Identity>() {
-            Some(Identity::Admin { .. }) => {}
-            Some(Identity::Anonymous) | None => {
-                return Err(Status::unauthenticated("a client certificate is needed"));
-            }
-            Some(other) => {
-                let text = format!("{} may not publish poses of robots", other.name());
-                return Err(Status::permission_denied(text));
-            }
-        }
+        let asker = Asker::of(&self.context, request.extensions());
+        asker
+            .needs(&auth::stream(("poses", "stream"), None, None))
+            .map_err(|failure| status_of(&failure))?;
         let (replies, outbound) = mpsc::channel(REPLIES);
-        let (poses, stop) = (Arc::clone(&self.poses), self.stop.clone());
+        let (poses, stop) = (Arc::clone(&self.poses), self.context.stop.clone());
         let inbound = request.into_inner();
         self.tasks.spawn(async move {
             let ended = tokio::select! {

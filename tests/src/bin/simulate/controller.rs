@@ -23,7 +23,7 @@ use muster_api::phase::TaskPhase;
 use muster_api::wire::agent::v1 as wire;
 use muster_api::wire::framework::v1 as framework;
 use muster_controller::app;
-use muster_controller::auth::Identity;
+use muster_controller::auth::{Asker, Identity};
 use muster_controller::config::Config;
 use muster_controller::context::{Clock, Context};
 use muster_controller::events::Recorder;
@@ -234,7 +234,9 @@ impl Controller {
         let (calls, inbound) = mpsc::unbounded_channel();
         let (reads, mut may_read) = watch::channel(true);
         self.guests.insert(conn, Guest { calls, reads });
-        let mut told = port.frameworks.begin(Box::pin(UnboundedReceiverStream::new(inbound)));
+        let mut told = port
+            .frameworks
+            .begin(Asker::admin("simulation"), Box::pin(UnboundedReceiverStream::new(inbound)));
         let outbox = Arc::clone(&self.outbox);
         drop(self.runtime.spawn(async move {
             // Whoever hangs up reads nothing more: what it would be told is dropped with the stream.

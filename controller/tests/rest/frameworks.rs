@@ -1,0 +1,70 @@
+//! Who may run a framework, and where; and what of it stands in the audit log.
+
+use http::Request;
+use http_body_util::BodyExt as _;
+use kube::Client;
+use serde_json::{Value, json};
+
+use super::support::*;
+
+/// Opens a session as JSON lines: the code, and its first event. The session lasts as long as the rest.
+async fn subscribe(client: &Client, namespace: &str) -> (u16, Value, kube::client::Body) {
+    let call = json!({"subscribe": {"name": "deliver", "namespace": namespace}});
+    let body = kube::client::Body::from(format!("{call}\n").into_bytes());
+    let request = Request::post("/framework/v1/session").body(body).unwrap();
+    let response = client.send(request).await.unwrap();
+    let code = response.status().as_u16();
+    let mut body = response.into_body();
+    let frame = tokio::time::timeout(DEADLINE, body.frame()).await.unwrap().unwrap().unwrap();
+    let first = frame.into_data().unwrap();
+    let line = first.split(|byte| *byte == b'\n').next().unwrap();
+    (code, serde_json::from_slice(line).unwrap(), body)
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_framework_is_run_where_its_role_is() {
+    let cluster = Cluster::start().await;
+    let admin = cluster.admin().await;
+    let namespace = json!({"apiVersion": "v1", "kind": "Namespace", "metadata": {"name": "lab"}});
+    assert_eq!(send(&admin, "POST", "/api/v1/namespaces", namespace).await.0, 201);
+    let give = async |role: &str, user: &str| {
+        let access = json!({
+            "apiVersion": "muster.dev/v1alpha1", "kind": "Access", "metadata": {"name": user},
+            "spec": {"role": role, "namespaces": ["lab"], "subjects": [{"name": user}]},
+        });
+        assert_eq!(send(&admin, "POST", &format!("{G}/accesses"), access).await.0, 201);
+        cluster.user(user).await
+    };
+    let courier = give("framework", "courier").await;
+    let viewer = give("viewer", "vera").await;
+    let other = give("framework", "other").await;
+
+    for refused in [&viewer, &cluster.agent("r1").await] {
+        let (code, status, _) = subscribe(refused, "lab").await;
+        assert_eq!(refusal(&(code, status)), (403, "Forbidden"));
+    }
+    let (code, status, _) = subscribe(&cluster.anonymous().await, "lab").await;
+    assert_eq!(refusal(&(code, status)), (401, "Unauthorized"));
+    let (code, event, _) = subscribe(&courier, "default").await;
+    assert_eq!((code, &event["error"]["reason"]), (200, &"Forbidden".into()), "{event}");
+    let message = event["error"]["message"].as_str().unwrap();
+    assert!(message.contains("resource \"frameworks/session\""), "{message}");
+
+    let (code, event, _lasts) = subscribe(&courier, "lab").await;
+    assert_eq!(code, 200);
+    let session = event["subscribed"]["sessionId"].as_str().unwrap().to_owned();
+    let calls = format!("/framework/v1/session/{session}/calls");
+    let revive = json!({"revive": {}});
+    assert_eq!(send(&courier, "POST", &calls, revive.clone()).await.0, 202);
+    let stolen = send(&other, "POST", &calls, revive).await;
+    assert_eq!(refusal(&stolen), (404, "NotFound"), "a session is its opener's");
+
+    let text = std::fs::read_to_string(cluster.dir.path().join("data/audit/audit.jsonl")).unwrap();
+    let line = text.lines().find(|line| line.contains("\"frameworks\"")).unwrap();
+    let line: Value = serde_json::from_str(line).unwrap();
+    assert_eq!(
+        (&line["user"], &line["verb"], &line["namespace"], &line["name"]),
+        (&"courier".into(), &"create".into(), &"lab".into(), &"deliver".into())
+    );
+    cluster.running.shut_down().await.unwrap();
+}
