@@ -1,5 +1,6 @@
 //! The main job with real processes, cgroups, SQLite and Docker.
 
+mod applications;
 mod cli;
 mod config;
 mod demo;
