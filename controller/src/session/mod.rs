@@ -73,14 +73,14 @@ pub struct Link {
     /// There and back.
     pub round_trip: Duration,
     /// The share of heartbeats that were not answered before the next one, 0 to 1.
-    pub loss: f64,
+    pub late: f64,
 }
 
 impl From<wire::Link> for Link {
     fn from(link: wire::Link) -> Self {
         Link {
             round_trip: Duration::from_micros(link.round_trip_usec),
-            loss: f64::from(link.late_permille.min(1000)) / 1000.0,
+            late: f64::from(link.late_permille.min(1000)) / 1000.0,
         }
     }
 }

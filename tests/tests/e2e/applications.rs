@@ -116,6 +116,13 @@ async fn a_part_moves_to_the_cloud_comes_home_when_that_is_drained_and_nothing_i
     let (_, why, _) = muster(&cluster, &["why", "app/corridor"]);
     assert!(why.contains("application/corridor is Running") && why.contains("at home"), "{why}");
 
+    let (_, top, _) = muster(&cluster, &["top", "nodes", "-o", "json"]);
+    let top: Value = serde_json::from_str(&top).expect("JSON");
+    for node in top["nodes"].as_array().expect("a list") {
+        let trip = node["link"]["roundTripUsec"].as_u64();
+        assert!(trip.is_some_and(|usec| usec > 0), "heartbeats measure the link: {top}");
+    }
+
     assert_eq!(muster(&cluster, &["drain", "cloud"]).0, 0);
     let home = serves_on(&cluster, "robot").await;
     wait::until("its process gone", || async {

@@ -108,7 +108,7 @@ async fn look(context: &Context, seen: &Seen, key: &Key) -> Result<Next, StoreEr
     let now = context.clock.now();
     let nothing = ApplicationStatus::default();
     let status = application.status.as_ref().unwrap_or(&nothing);
-    let nodes = seen.nodes(context);
+    let nodes = seen.nodes_of(context, &application);
     let tasks = seen::measured(context, tasks(context, &stored, status), now);
     let mut refused = BTreeMap::new();
     // What is refused is left out of the next plan; there are fewer new tasks than parts, so it ends.

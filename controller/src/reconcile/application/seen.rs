@@ -5,8 +5,10 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use jiff::Timestamp;
+use muster_api::kind::application::Application;
 use muster_api::kind::node::Node;
 use muster_api::name::NodeName;
+use muster_controller_core::offload::run::scales::is_scale;
 use muster_controller_core::offload::run::view::{NodeSeen, TaskSeen};
 
 use crate::context::Context;
@@ -87,15 +89,28 @@ impl Seen {
         }
     }
 
-    /// The nodes, with what is measured of their links now.
-    pub(super) fn nodes(&self, context: &Context) -> BTreeMap<String, NodeSeen> {
-        let mut nodes = self.nodes.clone().unwrap_or_default();
+    /// The nodes that concern an application, with what is measured of their links now.
+    pub(super) fn nodes_of(
+        &self,
+        context: &Context,
+        application: &Application,
+    ) -> BTreeMap<String, NodeSeen> {
+        let spec = &application.spec;
+        let parts = application.status.iter().flat_map(|status| &status.parts);
+        let mut named: BTreeSet<&str> =
+            parts.flat_map(|part| part.tasks()).map(|task| task.scale.as_str()).collect();
+        named.insert(&spec.home);
+        let concerns = |(name, node): &(&String, &NodeSeen)| {
+            named.contains(name.as_str()) || is_scale(spec, name, node)
+        };
+        let all = self.nodes.iter().flatten().filter(concerns);
+        let mut nodes: BTreeMap<String, NodeSeen> =
+            all.map(|(name, node)| (name.clone(), node.clone())).collect();
         let Some(live) = context.live() else { return nodes };
         for (name, node) in &mut nodes {
             let Ok(name) = NodeName::new(name.clone()) else { continue };
             if let Some(link) = live.sessions.link(&name) {
                 node.link.round_trip = Some(link.round_trip);
-                node.link.loss = link.loss;
             }
         }
         nodes

@@ -46,8 +46,6 @@ pub struct NodeSeen {
 pub struct LinkSeen {
     /// From the node to the controller and back; none: not measured yet.
     pub round_trip: Option<Duration>,
-    /// The share of messages that had to be sent again or got lost, 0 to 1.
-    pub loss: f64,
     /// What it carries, bits a second; none: nobody knows, and nothing is held to it.
     pub bandwidth: Option<f64>,
 }
