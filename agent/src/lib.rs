@@ -27,6 +27,7 @@
 //! | `footprint` | memory that is given back after the start |
 //! | `contact` | when the controller was last heard, for the shims too |
 //! | `mission` | mission locks that are set on the robot itself |
+//! | `told` | what tasks tell of topics and signals |
 //! | `link` | joining, the session, logs on request |
 //! | `node`, `capacity`, `position` | what this node is, has, and where it is |
 //! | `probe` | checks of running tasks |
@@ -65,6 +66,7 @@ pub mod shim;
 pub mod sim;
 mod spec;
 mod supervisor;
+mod told;
 
 pub use app::{AgentError, run, serve};
 pub use link::report::to_wire as report_to_wire;

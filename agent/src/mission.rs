@@ -40,9 +40,9 @@ pub(crate) fn locks(
     person.into_iter().chain(tasks).collect()
 }
 
-/// The first line of a file, as far as it is told. A task's file is the task's to fill: it is a regular file or it does not
-/// count, so that a look never waits.
-fn read(path: &Path) -> Option<String> {
+/// The beginning of a task's file, which is the task's to fill: it is a regular file or it does not count, so that a look
+/// never waits.
+pub(crate) fn text_of(path: &Path, most: u64) -> Option<String> {
     let named = std::fs::symlink_metadata(path).ok()?;
     if !named.is_file() {
         return None;
@@ -50,9 +50,14 @@ fn read(path: &Path) -> Option<String> {
     let mut bytes = Vec::new();
     // Set is set, also when it cannot be read.
     if let Ok(file) = File::open(path) {
-        let _ = file.take(LONGEST).read_to_end(&mut bytes);
+        let _ = file.take(most).read_to_end(&mut bytes);
     }
-    let text = String::from_utf8_lossy(&bytes);
+    Some(String::from_utf8_lossy(&bytes).into_owned())
+}
+
+/// The first line of a file, as far as it is told.
+fn read(path: &Path) -> Option<String> {
+    let text = text_of(path, LONGEST)?;
     let line = text.lines().next().unwrap_or_default();
     let shown = line.chars().filter(|c| !c.is_control());
     Some(shown.collect::<String>().trim().to_owned())

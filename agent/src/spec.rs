@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 
 use muster_agent_core::desired::{Desired, RestartPolicy, StopOrder};
 use muster_agent_core::workload::Fetch;
+use muster_api::duration::Span;
 use muster_api::kind::task::{self, TaskSpec};
 use muster_api::wire::WireError;
 use muster_api::wire::agent_session::spec_from_wire;
@@ -78,14 +79,17 @@ pub(crate) fn desired(spec: &TaskSpec, stop: Option<StopOrder>) -> Desired {
             task::RestartPolicy::Always => RestartPolicy::Always,
         },
         grace_ms: u64::from(spec.grace_period_seconds) * 1_000,
-        stop_after_ms: spec
-            .stop_after_disconnect()
-            .map(|span| u64::try_from(span.as_duration().as_millis()).unwrap_or(u64::MAX)),
+        stop_after_ms: spec.stop_after_disconnect().map(millis),
+        standby_ms: spec.standby.map(|standby| millis(standby.after)),
         probes: probe::probes(spec),
         depends: Vec::new(),
         attempts: None,
         stop,
     }
+}
+
+fn millis(span: Span) -> u64 {
+    u64::try_from(span.as_duration().as_millis()).unwrap_or(u64::MAX)
 }
 
 /// What the node adds to a launch.

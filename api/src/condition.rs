@@ -90,6 +90,8 @@ pub const PROGRESSING: &str = "Progressing";
 /// Of a TaskSet: some of its tasks cannot be created.
 pub const REPLICA_FAILURE: &str = "ReplicaFailure";
 
+/// Of an Application: something about it is not as it should be, and its reason says what.
+pub const DEGRADED: &str = "Degraded";
 /// Of an Application: muster runs its parts and moves them.
 pub const MANAGED: &str = "Managed";
 /// Of an Application: what it is and where it may run has been worked out from the newest spec.

@@ -5,6 +5,7 @@ use std::sync::Arc;
 
 use k8s_openapi::api::core::v1::{Event, EventSource, ObjectReference};
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::{ObjectMeta, Time};
+use muster_api::kind::application::Application;
 use muster_api::kind::namespace::DEFAULT;
 use muster_api::kind::task::Task;
 use muster_api::kind::taskset::TaskSet;
@@ -73,6 +74,18 @@ impl Recorder {
         self.put(Happening { about: set_reference(set), kind: "Warning", reason, message });
     }
 
+    /// Something usual about an application.
+    pub fn application(&self, app: &Application, reason: &'static str, message: String) {
+        let about = application_reference(app);
+        self.put(Happening { about, kind: "Normal", reason, message });
+    }
+
+    /// Something about an application that its owner should look at.
+    pub fn warn_application(&self, app: &Application, reason: &'static str, message: String) {
+        let about = application_reference(app);
+        self.put(Happening { about, kind: "Warning", reason, message });
+    }
+
     /// Something usual about a node.
     pub fn node(&self, node: &str, reason: &'static str, message: String) {
         self.put(Happening { about: node_reference(node), kind: "Normal", reason, message });
@@ -85,23 +98,24 @@ impl Recorder {
 }
 
 fn task_reference(task: &Task) -> ObjectReference {
-    ObjectReference {
-        api_version: Some(muster_api::API_VERSION.to_owned()),
-        kind: Some("Task".to_owned()),
-        name: task.metadata.name.clone(),
-        namespace: task.metadata.namespace.clone(),
-        uid: task.metadata.uid.clone(),
-        ..ObjectReference::default()
-    }
+    reference("Task", &task.metadata)
 }
 
 fn set_reference(set: &TaskSet) -> ObjectReference {
+    reference("TaskSet", &set.metadata)
+}
+
+fn application_reference(application: &Application) -> ObjectReference {
+    reference("Application", &application.metadata)
+}
+
+fn reference(kind: &str, metadata: &ObjectMeta) -> ObjectReference {
     ObjectReference {
         api_version: Some(muster_api::API_VERSION.to_owned()),
-        kind: Some("TaskSet".to_owned()),
-        name: set.metadata.name.clone(),
-        namespace: set.metadata.namespace.clone(),
-        uid: set.metadata.uid.clone(),
+        kind: Some(kind.to_owned()),
+        name: metadata.name.clone(),
+        namespace: metadata.namespace.clone(),
+        uid: metadata.uid.clone(),
         ..ObjectReference::default()
     }
 }

@@ -44,6 +44,10 @@ pub struct Desired {
     /// Present: it may run only while the controller was in contact within this time
     /// (`onDisconnect: Stop`), milliseconds.
     pub stop_after_ms: Option<u64>,
+    /// Present: it stands by. Its first attempt begins when this is taken away, or when there was no contact with the
+    /// controller for so long, milliseconds.
+    #[serde(default)]
+    pub standby_ms: Option<u64>,
     /// What is looked at while it runs.
     #[serde(default)]
     pub probes: Probes,
@@ -66,6 +70,7 @@ impl Desired {
             restart,
             grace_ms,
             stop_after_ms: None,
+            standby_ms: None,
             probes,
             depends: Vec::new(),
             attempts: None,

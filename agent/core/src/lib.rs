@@ -10,6 +10,7 @@
 //! | [`restart`] | when an ended task starts again, and after how long |
 //! | [`probe`] | when a running attempt is checked, and what follows from the answers |
 //! | [`depend`] | the tasks that a task waits for: how far they are, and who was started again |
+//! | [`link`] | how the link to the controller does |
 //! | [`journal`] | which reports a session has to say |
 //! | [`report`] | what is told to the controller, and its sequence |
 //! | [`image`] | images that are pulled before a task needs them: which now, which later |
@@ -32,6 +33,7 @@ pub mod executor;
 pub mod gate;
 pub mod image;
 pub mod journal;
+pub mod link;
 pub mod observed;
 pub mod plan;
 pub mod pose;

@@ -91,6 +91,8 @@ pub enum Reason {
     BackOff,
     /// It waits for contact with the controller (`onDisconnect: Stop`).
     AwaitingContact,
+    /// It stands by.
+    Standby,
     /// The agent could not read its assignment: a newer controller sent it.
     AssignmentUnreadable,
     /// A runtime's own word (`ImagePullFailed`, `QuotaNotEnforced` …).
@@ -132,6 +134,7 @@ impl fmt::Display for Reason {
             Reason::AwaitingExecutor => "AwaitingExecutor",
             Reason::BackOff => "BackOff",
             Reason::AwaitingContact => "AwaitingContact",
+            Reason::Standby => "Standby",
             Reason::AssignmentUnreadable => "AssignmentUnreadable",
             Reason::Runtime(word) => word,
         })

@@ -13,6 +13,8 @@
 
 mod failed;
 mod probed;
+#[cfg(test)]
+mod standby;
 mod waited;
 
 use std::collections::BTreeMap;
@@ -320,9 +322,12 @@ impl Workload {
             let grace_ms = self.desired.grace_ms;
             stop.iter_mut().for_each(|order| order.grace_ms = order.grace_ms.min(grace_ms));
         }
+        let let_go = self.desired.standby_ms.is_some() && desired.standby_ms.is_none();
         self.desired = Desired { stop, ..desired };
         if sooner {
             self.end_if_wanted(context, effects);
+        } else if let_go {
+            self.move_on(context, effects);
         }
     }
 
@@ -419,6 +424,9 @@ impl Workload {
         let State::Waiting { until } = self.state else { return };
         if context.now.boot < until {
             effects.push(Effect::WakeAt(until));
+        } else if let Some(due) = self.stands_by_until(context) {
+            self.say(Reason::Standby, "stands by".to_owned());
+            effects.push(Effect::WakeAt(due));
         } else if self.waits_for_others() {
             // Told anew when one of them has come farther.
         } else if self.in_contact(context) {
@@ -434,6 +442,15 @@ impl Workload {
         } else {
             self.say(Reason::AwaitingContact, "waits for contact with the controller".to_owned());
         }
+    }
+
+    /// Until when nothing of it begins, if there is no contact till then; none: it does not stand by, or no longer. What has
+    /// begun once, on whosever word, goes on as other tasks do.
+    fn stands_by_until(&self, context: Context) -> Option<Boot> {
+        let after = self.desired.standby_ms.filter(|_| self.attempt == 0)?;
+        // Without any contact since the machine started, it counts from there.
+        let due = context.contact.unwrap_or(Boot(0)).plus(after);
+        (due > context.now.boot).then_some(due)
     }
 
     fn in_contact(&self, context: Context) -> bool {

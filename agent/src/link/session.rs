@@ -16,6 +16,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use muster_agent_core::journal::Journal;
+use muster_agent_core::link::RoundTrips;
 use muster_agent_core::time::Boot;
 use muster_api::id::TaskUid;
 use muster_api::wire::agent::v1 as proto;
@@ -37,6 +38,7 @@ use crate::executor::direct::Door;
 use crate::executor::frame::FRAME_MAX;
 use crate::gate::keeper::Standing;
 use crate::node::Node;
+use crate::told;
 
 /// Messages under way to the controller. Short: whoever has much to say (logs) waits here.
 const QUEUE: usize = 32;
@@ -170,6 +172,7 @@ impl Link {
             journal: Journal::begun(said, clock::boot()),
             beats: BTreeMap::new(),
             beat: 0,
+            trips: RoundTrips::default(),
             readers: JoinSet::new(),
             requests: BTreeMap::new(),
         };
@@ -206,8 +209,9 @@ struct Session<'a> {
     out: mpsc::Sender<proto::AgentMessage>,
     journal: Journal,
     /// When heartbeats without an answer were sent.
-    beats: BTreeMap<u64, Boot>,
+    beats: BTreeMap<u64, (Boot, Instant)>,
     beat: u64,
+    trips: RoundTrips,
     readers: JoinSet<u64>,
     requests: BTreeMap<u64, AbortHandle>,
 }
@@ -271,8 +275,10 @@ impl Session<'_> {
                 let _ = self.link.commands.send(Command::Assign(assignments)).await;
             }
             Hear::Heartbeat(answer) => {
-                if let Some(sent) = self.beats.remove(&answer.sequence) {
+                if let Some((sent, at)) = self.beats.remove(&answer.sequence) {
                     self.link.shared.contact.made(sent);
+                    let took = u64::try_from(at.elapsed().as_micros()).unwrap_or(u64::MAX);
+                    self.trips.answered(took);
                 }
                 self.beats.retain(|sequence, _| *sequence > answer.sequence);
             }
@@ -338,8 +344,10 @@ impl Session<'_> {
         if let Some(state) = self.node.changed() {
             self.say(Say::Node(state)).await?;
         }
+        self.trips.sent(self.beats.contains_key(&self.beat));
         self.beat += 1;
-        let usage = self.link.shared.board.sample().into_iter();
+        let shared = &self.link.shared;
+        let usage = shared.board.sample().into_iter();
         let usage = usage.map(|usage| proto::TaskUsage {
             uid: usage.uid.to_string(),
             usage: Some(proto::Usage {
@@ -347,14 +355,19 @@ impl Session<'_> {
                 memory_bytes: usage.used.memory_bytes,
                 cpu_total_usec: usage.used.cpu_usec,
             }),
+            told: told::observed(&shared.checkpoint.task_dir(&usage.uid).join("run")),
         });
         let heartbeat = proto::Heartbeat {
             sequence: self.beat,
             pose: None,
             usage: usage.collect(),
             node: self.node.usage(),
+            link: self.trips.usec().map(|round_trip_usec| proto::Link {
+                round_trip_usec,
+                late_permille: self.trips.late_permille(),
+            }),
         };
-        self.beats.insert(self.beat, clock::boot());
+        self.beats.insert(self.beat, (clock::boot(), Instant::now()));
         self.say(Say::Heartbeat(heartbeat)).await
     }
 

@@ -1,8 +1,7 @@
 //! Applications: whose they are, and what of them may move.
 
-use crate::condition::MANAGED;
 use crate::kind::application::pin::pins;
-use crate::kind::application::{Application, Policy};
+use crate::kind::application::{Application, ApplicationPhase, Policy};
 
 use super::{Cell, Column, Mood, age};
 
@@ -12,7 +11,7 @@ pub(super) const COLUMNS: &[Column<Application>] = &[
     Column::new("MIGRATABLE", |app, _| migratable(app).into()),
     Column::new("AWAY", |app, _| away(app)),
     Column::new("POLICY", |app, _| policy(app.spec.policy).into()),
-    Column::new("MANAGED", |app, _| managed(app)),
+    Column::new("PHASE", |app, _| phase(app)),
     Column::new("AGE", |app, now| age(app.metadata.creation_timestamp.as_ref(), now)),
     Column::wide("SCALES", |app, _| {
         app.status.as_ref().map(|s| s.scales.join(",")).unwrap_or_default().into()
@@ -44,7 +43,12 @@ pub fn policy(policy: Policy) -> &'static str {
     }
 }
 
-fn managed(app: &Application) -> Cell {
-    let condition = app.status.as_ref().and_then(|s| s.condition(MANAGED));
-    condition.map_or_else(|| Cell::from(""), |c| Cell::new(format!("{:?}", c.status), Mood::Plain))
+fn phase(app: &Application) -> Cell {
+    let mood = |phase| match phase {
+        ApplicationPhase::Running => Mood::Good,
+        ApplicationPhase::Pending => Mood::Plain,
+        ApplicationPhase::Degraded => Mood::Warn,
+    };
+    let phase = app.status.as_ref().map(|s| s.phase);
+    phase.map_or_else(|| Cell::from(""), |phase| Cell::new(format!("{phase:?}"), mood(phase)))
 }

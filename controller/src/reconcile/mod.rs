@@ -15,7 +15,7 @@
 //! | [`quotas`] | the scheduler's ledger | writes what namespaces have into Quota status |
 //! | [`health`] | heartbeats | marks silent nodes and their tasks |
 //! | [`taskset`] | TaskSets, their tasks, nodes | begins and ends tasks, changes them, goes back |
-//! | [`application`] | Applications, Nodes | writes which parts may move, and where; nothing moves them yet |
+//! | [`application`] | Applications, their tasks, nodes, what is measured | begins and ends the tasks of parts, moves them |
 //! | [`upkeep`] | Nodes with batteries and maintenance windows | says when nothing new begins there, ends what is to be gone |
 //! | [`orders`] | Nodes | tells their agents of emergency stops |
 //! | [`images`] | TaskSets | tells agents which images rollouts want on their nodes |
@@ -37,6 +37,7 @@ pub mod history;
 pub mod images;
 mod moves;
 pub mod orders;
+mod owned;
 mod preempt;
 pub mod quotas;
 pub mod radius;

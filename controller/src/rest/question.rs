@@ -35,11 +35,19 @@ pub(super) fn usage(call: &Call) -> Answer {
     let live = live(&call.context)?;
     let (mut nodes, mut tasks) = (Vec::new(), Vec::new());
     for (name, usage) in live.sessions.usage() {
-        nodes.push(json!({
+        let mut node = json!({
             "name": name.as_str(),
             "cpuMillis": usage.node.cpu_millis,
             "memoryBytes": usage.node.memory_bytes,
-        }));
+        });
+        if let Some(link) = usage.link {
+            // To the controller and back; and of the last heartbeats, the share that was answered late.
+            node["link"] = json!({
+                "roundTripUsec": u64::try_from(link.round_trip.as_micros()).unwrap_or(u64::MAX),
+                "late": link.late,
+            });
+        }
+        nodes.push(node);
         for task in &usage.tasks {
             let Some((_, key)) = live.sessions.board().find(&task.uid) else { continue };
             let namespace = key.namespace().unwrap_or_default();

@@ -432,7 +432,11 @@ impl Session {
         if let Some(pose) = &heartbeat.pose {
             self.take_pose(pose)?;
         }
-        let usage = NodeUsage { node: heartbeat.node.unwrap_or_default(), tasks: heartbeat.usage };
+        let usage = NodeUsage {
+            node: heartbeat.node.unwrap_or_default(),
+            tasks: heartbeat.usage,
+            link: heartbeat.link.map(Into::into),
+        };
         self.sessions.set_usage(&self.node, usage);
         self.send(ToAgent::Heartbeat(wire::HeartbeatAck { sequence: heartbeat.sequence })).await
     }

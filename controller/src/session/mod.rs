@@ -90,6 +90,26 @@ pub struct NodeUsage {
     pub node: wire::Usage,
     /// By task uid.
     pub tasks: Vec<wire::TaskUsage>,
+    /// Its link to here; none: not measured yet.
+    pub link: Option<Link>,
+}
+
+/// A node's link to the controller, as its heartbeats measure it.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Link {
+    /// There and back.
+    pub round_trip: Duration,
+    /// The share of heartbeats that were not answered before the next one, 0 to 1.
+    pub late: f64,
+}
+
+impl From<wire::Link> for Link {
+    fn from(link: wire::Link) -> Self {
+        Link {
+            round_trip: Duration::from_micros(link.round_trip_usec),
+            late: f64::from(link.late_permille.min(1000)) / 1000.0,
+        }
+    }
 }
 
 /// A connected agent.
@@ -208,6 +228,19 @@ impl Sessions {
     #[must_use]
     pub fn usage(&self) -> UsageTable {
         lock(&self.usage).clone()
+    }
+
+    /// What a task used and told, as its node's last heartbeat said.
+    #[must_use]
+    pub fn usage_of(&self, node: &NodeName, uid: &str) -> Option<wire::TaskUsage> {
+        let usage = lock(&self.usage);
+        usage.get(node)?.tasks.iter().find(|task| task.uid == uid).cloned()
+    }
+
+    /// How a node's link to here does.
+    #[must_use]
+    pub fn link(&self, node: &NodeName) -> Option<Link> {
+        lock(&self.usage).get(node)?.link
     }
 
     pub(crate) fn set_usage(&self, node: &NodeName, usage: NodeUsage) {

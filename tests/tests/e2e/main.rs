@@ -1,6 +1,7 @@
 //! The main job with real processes, cgroups, SQLite and Docker.
 
 mod access;
+mod applications;
 mod cli;
 mod config;
 mod demo;

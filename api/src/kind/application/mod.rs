@@ -17,7 +17,10 @@ use kube::CustomResource;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-pub use status::{ApplicationStatus, Obstacle, PartClass, PartStatus, PinStatus};
+pub use status::{
+    ApplicationPhase, ApplicationStatus, AttemptStatus, ConnectionStatus, MAX_TIMELINE,
+    MappingStatus, MoveStage, Obstacle, PartClass, PartStatus, PinStatus, SignalStatus, stamp,
+};
 
 use super::KindInfo;
 use super::task::TaskSpec;
@@ -25,6 +28,11 @@ use super::taskset::TemplateMetadata;
 use crate::duration::Span;
 use crate::quantity::{BitRate, MilliCpu};
 use crate::selector::LabelSelector;
+
+/// On each task of an application: its name.
+pub const APPLICATION_LABEL: &str = "muster.dev/application";
+/// On each task of an application: the part.
+pub const PART_LABEL: &str = "muster.dev/part";
 
 /// Parts and connections, and how they may be spread over the robot and the scales.
 #[derive(CustomResource, Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -246,11 +254,30 @@ pub enum Policy {
     Home,
 }
 
+/// The name of a part's task, which [`rules`] keep short enough. Numbers come again after a hundred thousand.
+#[must_use]
+pub fn task_name(application: &str, part: &str, number: u64) -> String {
+    format!("{application}-{part}-{}", number % 100_000)
+}
+
 impl ApplicationSpec {
     /// The part of this name.
     #[must_use]
     pub fn part(&self, name: &str) -> Option<&Part> {
         self.parts.iter().find(|p| p.name == name)
+    }
+}
+
+impl PartTemplate {
+    /// Letters that stand for what it says: a changed template has others.
+    ///
+    /// # Panics
+    ///
+    /// Never: a template is texts, numbers, lists and maps.
+    #[must_use]
+    pub fn digest(&self) -> String {
+        let text = serde_json::to_vec(self).expect("a template serializes to JSON");
+        super::taskset::digest(&text, 0)
     }
 }
 

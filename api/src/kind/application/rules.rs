@@ -13,8 +13,8 @@ use crate::validate::{Violations, did_you_mean, element_path, member_path};
 
 /// More parts than any graph of ROS nodes has; a decision over them still takes less than a period.
 const MAX_PARTS: usize = 200;
-/// The task of a part is called APPLICATION-PART, and that is a name and a label.
-const MAX_APPLICATION_NAME: usize = 40;
+/// The task of a part is called APPLICATION-PART-NUMBER (see [`super::task_name`]), and that is a name and a label.
+const MAX_APPLICATION_NAME: usize = 34;
 const MAX_PART_NAME: usize = 22;
 
 pub(super) fn admit_body(object: &mut Value, violations: &mut Violations) {
@@ -185,6 +185,26 @@ fn template_rules(part: &Part, path: &str, violations: &mut Violations) {
                 "is decided by the Application: at home, or on one of its scales",
             )
             .suggest("leave it out; spec.home and spec.scales say where parts may run");
+    }
+    let given = [
+        (
+            "standby",
+            task.standby.is_some(),
+            "what stands by for a part is the Application's to say",
+        ),
+        (
+            "reschedule",
+            task.reschedule.is_some(),
+            "where a part is tried is decided by the Application",
+        ),
+        (
+            "ttlSecondsAfterFinished",
+            task.ttl_seconds_after_finished.is_some(),
+            "a part whose task is gone is begun again",
+        ),
+    ];
+    for (field, _, why) in given.into_iter().filter(|(_, given, _)| *given) {
+        violations.forbidden(format!("{path}.spec.{field}"), why).suggest("leave it out");
     }
     let wanted = match part.runs {
         Runs::Once if task.restart_policy == RestartPolicy::Always => "OnFailure",

@@ -79,6 +79,27 @@ fn a_tolerance_that_no_return_can_keep_is_refused() {
 }
 
 #[test]
+fn what_would_take_a_part_s_task_out_of_the_application_s_hands_is_refused() {
+    let mut once = part("map");
+    once["template"]["spec"]["ttlSecondsAfterFinished"] = 5.into();
+    once["template"]["spec"]["standby"] = json!({"after": "5s"});
+    assert_eq!(
+        problems(&json!({"home": "r", "parts": [once]})),
+        [
+            "spec.parts[0].template.spec.standby: what stands by for a part is the Application's to say; leave it out",
+            "spec.parts[0].template.spec.ttlSecondsAfterFinished: a part whose task is gone is begun again; leave it out",
+        ]
+    );
+}
+
+#[test]
+fn a_task_s_name_is_short_enough_for_a_name() {
+    let (application, part) = ("a".repeat(34), "p".repeat(22));
+    assert_eq!(task_name(&application, &part, 99_999).len(), crate::name::MAX_NAME_LEN);
+    assert_eq!(task_name("a", "p", 100_001), "a-p-1");
+}
+
+#[test]
 fn home_does_not_change() {
     let spec = |home: &str| {
         admit(&application(&json!({"home": home, "parts": [part("a")]}))).expect("admitted")

@@ -97,6 +97,18 @@ pub struct TaskSpec {
     /// answer is its end.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub reschedule: Option<Reschedule>,
+    /// It stands by: it is placed, and what it needs is kept for it, but it is not begun. It may be taken away, and begins
+    /// then; nothing puts it back.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub standby: Option<Standby>,
+}
+
+/// When a task that stands by begins, if nobody says so before.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "camelCase", deny_unknown_fields)]
+pub struct Standby {
+    /// Its node begins it by itself when it has had no contact with the controller for so long.
+    pub after: Span,
 }
 
 /// What a task that finds no room may do about it.

@@ -42,6 +42,27 @@ pub(in crate::kind) fn rules(spec: &TaskSpec, violations: &mut Violations) {
             .forbidden("spec.onDisconnect.after", "means nothing with the policy Keep")
             .suggest("leave it out, or set policy: Stop");
     }
+    standby_rules(spec, violations);
+}
+
+/// What stands by begins without the controller's word: nothing may depend on who else runs meanwhile.
+fn standby_rules(spec: &TaskSpec, violations: &mut Violations) {
+    let Some(standby) = &spec.standby else { return };
+    if standby.after.as_duration().is_zero() {
+        violations
+            .invalid("spec.standby.after", "0s lets it stand by for no time")
+            .suggest("leave spec.standby out, or name a time without contact, such as \"10s\"");
+    }
+    if !spec.resources.actuators.is_empty() {
+        violations
+            .forbidden("spec.standby", "a task with actuators would keep them from everybody")
+            .suggest("leave it out: a lease passes on when its holder ends");
+    }
+    if spec.run.executor.is_some() {
+        violations
+            .forbidden("spec.standby", "an executor begins its work when it is given it")
+            .suggest("leave it out");
+    }
 }
 
 fn placement_rules(spec: &TaskSpec, violations: &mut Violations) {
@@ -245,6 +266,9 @@ pub(super) fn change_rules(old: &Value, new: &Value, violations: &mut Violations
     let spec =
         |object: &Value| object.get("spec").and_then(Value::as_object).cloned().unwrap_or_default();
     let (mut old, mut new) = (spec(old), spec(new));
+    if !new.contains_key("standby") {
+        old.remove("standby");
+    }
     for spec in [&mut old, &mut new] {
         spec.retain(|key, _| !MUTABLE.contains(&key.as_str()));
         if let Some(placement) = spec.get_mut("placement").and_then(Value::as_object_mut) {

@@ -74,6 +74,22 @@ fn what_can_never_be_placed_is_refused() {
 }
 
 #[test]
+fn a_task_that_stands_by_may_be_let_go_and_not_be_called_back() {
+    let info = find(crate::API_VERSION, "Task").expect("served");
+    let stands = admit(&sleep(json!({"standby": {"after": "8s"}}))).expect("good");
+    let runs = admit(&sleep(json!({}))).expect("good");
+    admit_change(info, &stands, &runs).expect("it is begun");
+    let back = admit_change(info, &runs, &stands).expect_err("it runs").to_string();
+    assert!(back.starts_with("spec.standby"), "{back}");
+    let wrong = sleep(json!({
+        "standby": {"after": "0s"}, "resources": {"actuators": ["base:Drive"]},
+    }));
+    let wrong: Vec<String> =
+        admit(&wrong).expect_err("refused").iter().map(|v| v.path.clone()).collect();
+    assert_eq!(wrong, ["spec.standby.after", "spec.standby"]);
+}
+
+#[test]
 fn only_priority_grace_and_tolerations_may_change() {
     let info = find(crate::API_VERSION, "Task").expect("served");
     let old = admit(&sleep(json!({"resources": {"cpu": 1}}))).expect("good");

@@ -44,6 +44,9 @@ fn state(sheet: &mut Sheet, task: &Task, status: &TaskStatus, now: Timestamp) {
     sheet.maybe("To end", status.stop.as_ref().map(|s| format!("{}: {}", s.reason, s.message)));
     let seconds = |seconds: u32| format!("{seconds} s");
     sheet.maybe("Deadline", task.spec.active_deadline_seconds.map(seconds));
+    let standby = task.spec.standby.map(|standby| standby.after);
+    let standby = standby.map(|after| format!("until its node had no contact for {after}"));
+    sheet.maybe("Stands by", standby);
     sheet.maybe("Kept after its end", task.spec.ttl_seconds_after_finished.map(seconds));
     let cost = task.spec.placement.cost;
     sheet.maybe("Score", status.score.map(|s| columns::score(s, cost)));

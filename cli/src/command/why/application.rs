@@ -1,6 +1,6 @@
 //! An Application: for each part where it is and why, and what stands between it and the other scales.
 
-use muster_api::condition::MANAGED;
+use muster_api::condition::{ConditionStatus, DEGRADED};
 use muster_api::kind::application::{Application, ApplicationStatus};
 use serde_json::{Value, json};
 
@@ -16,10 +16,11 @@ pub(super) fn told(
     let app: Application = serde_json::from_value(asked.object.clone())?;
     let nothing = ApplicationStatus::default();
     let status = app.status.as_ref().unwrap_or(&nothing);
-    let managed = status.condition(MANAGED);
-    let said = managed.map_or("nobody has looked at it yet", |c| c.message.as_str());
-    let said = if said.is_empty() { "its parts are run and moved" } else { said };
-    let mut text = format!("application/{}: {said}.\n", asked.name);
+    let mut text = format!("application/{} {}.\n", asked.name, stands(status));
+    if let Some(value) = status.value {
+        let bound = status.bound.map(|b| format!("; no mapping is worth more than {b:.3}"));
+        text.push_str(&format!("It is worth {value:.3}{}.\n", bound.unwrap_or_default()));
+    }
     if !status.parts.is_empty() {
         let mut table = Table::new(["PART", "CLASS", "NOW", "WHY"]);
         for part in &status.parts {
@@ -42,6 +43,19 @@ pub(super) fn told(
     Ok((text, json!({"status": status})))
 }
 
+/// How it is, and where it is not as it should be.
+fn stands(status: &ApplicationStatus) -> String {
+    if status.observed_generation == 0 {
+        return "waits: nobody has looked at it yet".to_owned();
+    }
+    let phase = format!("is {:?}", status.phase);
+    let worry = status.condition(DEGRADED).filter(|c| c.status == ConditionStatus::True);
+    match worry {
+        None => phase,
+        Some(worry) => format!("{phase}; {}: {}", worry.reason, worry.message),
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -52,7 +66,8 @@ mod tests {
             "apiVersion": "muster.dev/v1alpha1", "kind": "Application", "metadata": {"name": "a"},
             "spec": {"home": "r", "parts": [{"name": "ar", "template": {"spec": {}}}]},
             "status": {
-                "conditions": [{"type": "Managed", "status": "False", "message": "nothing is run"}],
+                "observedGeneration": 1, "phase": "Running", "value": 1.5, "bound": 2.0,
+                "conditions": [{"type": "Degraded", "status": "True", "reason": "TaskUnreachable", "message": "it may run"}],
                 "parts": [{
                     "name": "ar", "class": "Migratable", "scale": "r", "message": "is at home",
                     "elsewhere": [{"scale": "c", "reason": "BandwidthExceeded", "message": "4Mbit/s more", "gain": 0.825}],
@@ -63,7 +78,8 @@ mod tests {
         let (text, value) = told(&asked, &Styles::default()).expect("it reads");
         assert_eq!(
             text,
-            "application/a: nothing is run.\n\
+            "application/a is Running; TaskUnreachable: it may run.\n\
+             It is worth 1.500; no mapping is worth more than 2.000.\n\
              \nPART   CLASS        NOW   WHY\n\
              ar     Migratable   r     is at home\n\
              \nPART   SCALE   GAIN     BINDS               WHY\n\

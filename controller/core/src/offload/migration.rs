@@ -80,6 +80,11 @@ pub enum Event {
     Switched(u64),
     /// An attempt has ended; nothing of it runs.
     Gone(u64),
+    /// What served has ended, and nothing follows it: it is begun again.
+    Lost {
+        /// In its place.
+        again: Attempt,
+    },
     /// The move is not wanted any more.
     Abort,
     /// What is away cannot be reached for the time after which the robot may act alone, or is known to have ended; with the
@@ -170,6 +175,7 @@ impl Stage {
                 stage: Stage::Aborting { serves, next },
                 acts: vec![Act::Connect(serves), Act::Stop(next)],
             },
+            (_, Event::Lost { again }) => self.again(again).unwrap_or_else(stay),
             (_, Event::Gone(uid)) => self.gone(uid).unwrap_or_else(stay),
             (_, Event::CutOff { standby }) => self.cut_off(standby).unwrap_or_else(stay),
             (Stage::Alone { lost, also, .. }, Event::Contact) => Step {
@@ -212,6 +218,18 @@ impl Stage {
             }
             _ => None,
         }
+    }
+
+    /// Another one in the place of the one that served. While the next one is starting, that follows.
+    fn again(self, again: Attempt) -> Option<Step> {
+        let stage = match self {
+            Stage::Settled { .. } => Stage::Settled { serves: again },
+            Stage::Breaking { old, .. } => Stage::Breaking { serves: again, old },
+            Stage::Aborting { next, .. } => Stage::Aborting { serves: again, next },
+            Stage::Alone { lost, also, .. } => Stage::Alone { serves: again, lost, also },
+            Stage::Making { .. } | Stage::Switching { .. } => return None,
+        };
+        Some(Step { stage, acts: vec![Act::Start(again), Act::Connect(again)] })
     }
 
     /// The robot alone: what is at home serves, or the standby is started.

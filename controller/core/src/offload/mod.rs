@@ -3,7 +3,7 @@
 //! ```text
 //!   spec ──Model::of──▶ Model (critical parts pinned, impossible mappings pruned)
 //!   Model + what is so now ──▶ Snapshot ──plan(now)──▶ Plan { actions, mapping, reasons, fallback, look_again }
-//!   one action ──▶ migration::Migration ──▶ start there, switch the connections, stop here
+//!   one action ──▶ migration::Stage ──▶ start there, switch the connections, stop here
 //! ```
 //!
 //! | module | decides |
@@ -17,6 +17,7 @@
 //! | [`policy`] | what is moved, and when it is not |
 //! | [`migration`] | make before break; what a robot does alone |
 //! | [`reason`] | why a part is where it is, and what it would take |
+//! | [`run`] | the tasks of the parts: begun, moved, ended |
 //!
 //! Rules that hold whatever happens, each with a test of its name in `tests` or `crate::simulation`:
 //!
@@ -32,6 +33,7 @@ pub mod model;
 pub mod policy;
 pub mod problem;
 pub mod reason;
+pub mod run;
 pub mod solver;
 #[cfg(test)]
 mod tests;

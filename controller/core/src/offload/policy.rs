@@ -323,6 +323,10 @@ impl<'a> Case<'a> {
         if let Some(why) = scale.unfit.clone().filter(|_| away) {
             return Obstacle::Unfit { why };
         }
+        let bar = self.snapshot.bar(self.items[item], there[item]);
+        if let Some(why) = bar.filter(|_| away) {
+            return Obstacle::Unfit { why: why.to_owned() };
+        }
         if away && !scale.link.up {
             return Obstacle::LinkDown { since: scale.link.since };
         }
@@ -369,14 +373,19 @@ fn item(snapshot: &Snapshot<'_>, part: usize) -> Item {
         let home = &snapshot.scales[HOME];
         k == HOME
             || k == snapshot.parts[part].scale
-            || (scale.unfit.is_none() && scale.link.up && home.link.up)
+            || (scale.unfit.is_none()
+                && snapshot.bar(part, k).is_none()
+                && scale.link.up
+                && home.link.up)
     };
+    // Elsewhere its task reserves what its template says, however little it uses.
+    let needs = |k: usize| if k == HOME { cpu[HOME] } else { cpu[k].max(model.quota) };
     Item {
         value: (0..cpu.len()).map(value).collect(),
         allowed: (0..cpu.len()).map(usable).collect(),
         memory: model.memory,
         traffic,
-        cpu,
+        cpu: (0..cpu.len()).map(needs).collect(),
     }
 }
 

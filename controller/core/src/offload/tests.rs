@@ -25,8 +25,7 @@ fn at(seconds: f64) -> Timestamp {
 impl Bed {
     fn new() -> Self {
         let model = corridor();
-        let part =
-            PartView { scale: 0, moving: false, moved_at: None, active: true, learned: Vec::new() };
+        let part = PartView { active: true, ..PartView::default() };
         Bed {
             scales: vec![roomy("youbot", 1.0, at(0.0)), roomy("laptop", 3.5, at(0.0))],
             parts: vec![part; model.parts.len()],

@@ -50,7 +50,7 @@ pub struct LinkView {
 }
 
 /// A part.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, Default, PartialEq)]
 pub struct PartView {
     /// Where it serves, an index into the scales.
     pub scale: usize,
@@ -62,6 +62,8 @@ pub struct PartView {
     pub active: bool,
     /// Measured mean use of cpu, cores by scale; none: not known.
     pub learned: Vec<Option<f64>>,
+    /// By scale, why this part cannot run there, whatever else does; none, or no entry: it can.
+    pub barred: Vec<Option<String>>,
 }
 
 /// A connection.
@@ -90,6 +92,12 @@ impl Snapshot<'_> {
         };
         let here = declared.or_else(|| learned(scale));
         here.or(model.cpu).or_else(|| learned(super::problem::HOME)).unwrap_or(model.quota)
+    }
+
+    /// Why a part cannot run on a scale whatever happens.
+    #[must_use]
+    pub fn bar(&self, part: usize, scale: usize) -> Option<&str> {
+        self.parts[part].barred.get(scale).and_then(Option::as_deref)
     }
 
     /// A connection's ends are on different scales, and something is expected on it.

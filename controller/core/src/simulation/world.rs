@@ -381,7 +381,7 @@ fn part_view(runner: &Runner) -> PartView {
         moving: !matches!(runner.stage, Stage::Settled { .. }),
         moved_at: runner.moved_at,
         active: true,
-        learned: Vec::new(),
+        ..PartView::default()
     }
 }
 

@@ -3,14 +3,13 @@
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::Arc;
 
-use k8s_openapi::apimachinery::pkg::apis::meta::v1::ObjectMeta;
 use muster_api::kind::node::Node;
 use muster_api::kind::taskset::TaskSet;
 use muster_api::selector::{LabelSelector, Labels};
 use muster_controller_core::taskset::view::{NodeView, TaskView};
-use serde::Deserialize;
 
 use crate::objects::{self, NODES, REVISIONS, TASK_SETS, TASKS};
+use crate::reconcile::owned::Whose;
 use crate::store::{Change, Key, Stored};
 
 /// What is remembered of a set.
@@ -36,19 +35,6 @@ pub(super) struct Index {
     dirty: BTreeSet<Key>,
 }
 
-/// The part of an object that says whose it is.
-#[derive(Debug, Deserialize)]
-struct Whose {
-    metadata: ObjectMeta,
-}
-
-impl Whose {
-    fn controller(&self) -> Option<String> {
-        let mut owners = self.metadata.owner_references.iter().flatten();
-        owners.find(|o| o.controller == Some(true)).map(|o| o.uid.clone())
-    }
-}
-
 impl Index {
     pub(super) fn take_in(&mut self, change: Change, stored: &Arc<Stored>) {
         let resource = stored.key.resource;
@@ -59,9 +45,10 @@ impl Index {
         } else if resource == TASK_SETS {
             self.take_in_set(change, stored);
         } else if resource == REVISIONS
-            && let Some(owner) = objects::read::<Whose>(stored).and_then(|w| w.controller())
+            && let Some(whose) = objects::read::<Whose>(stored)
+            && let Some(owner) = whose.controller()
         {
-            self.mark_uid(&owner);
+            self.mark_uid(&owner.uid);
         }
     }
 
@@ -94,7 +81,7 @@ impl Index {
             return;
         }
         let whose = objects::read::<Whose>(stored);
-        let controller = whose.as_ref().and_then(Whose::controller);
+        let controller = whose.as_ref().and_then(Whose::controller).map(|owner| owner.uid.clone());
         self.tasks.insert(key.clone(), controller.clone());
         match (controller, whose.and_then(|w| w.metadata.labels)) {
             (Some(uid), _) => {

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use jiff::Timestamp;
-use k8s_openapi::apimachinery::pkg::apis::meta::v1::{ObjectMeta, OwnerReference, Time};
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 use muster_api::condition::{Condition, ConditionStatus, REPLICA_FAILURE, set_condition};
 use muster_api::kind::node::Node;
 use muster_api::kind::task::{Task, TaskSpec};
@@ -18,7 +18,8 @@ use muster_controller_core::taskset::{Action, NewTask, News, Place, Plan};
 use crate::context::Context;
 use crate::objects::{self, REVISIONS, TASKS};
 use crate::quota::Pass;
-use crate::rest::create::{namespace_guard, pass, prepare_object};
+use crate::reconcile::owned::Owner;
+use crate::rest::create::namespace_guard;
 use crate::rest::delete;
 use crate::rest::failure::Failure;
 use crate::store::{Key, Op, Precondition, StoreError, Stored};
@@ -148,15 +149,17 @@ impl Work<'_> {
                     ops.push(self.revision(name, |revision| revision.spec.revision = *number)?);
                 }
                 Action::AdoptRevision { name } => {
-                    ops.push(self.revision(name, |r| self.own(&mut r.metadata))?);
+                    ops.push(self.revision(name, |r| self.owner().own(&mut r.metadata))?);
                 }
                 Action::DeleteRevision { name } => {
                     let present = self.get(&self.revision_key(name))?;
                     ops.push(Op::remove(present.key.clone(), present.revision));
                 }
-                Action::Adopt { task } => ops.push(self.task(task, |t| self.own(&mut t.metadata))?),
+                Action::Adopt { task } => {
+                    ops.push(self.task(task, |t| self.owner().own(&mut t.metadata))?)
+                }
                 Action::Release { task } => {
-                    ops.push(self.task(task, |t| self.disown(&mut t.metadata))?);
+                    ops.push(self.task(task, |t| self.owner().disown(&mut t.metadata))?);
                 }
                 Action::Create(new) => {
                     let made = self.new_task(new, plan)?;
@@ -195,24 +198,8 @@ impl Work<'_> {
         self.context.store.get(key).ok_or(Stop::Raced)
     }
 
-    fn owner(&self) -> OwnerReference {
-        OwnerReference {
-            api_version: muster_api::API_VERSION.to_owned(),
-            kind: "TaskSet".to_owned(),
-            name: self.stored.key.name.to_string(),
-            uid: self.stored.uid.to_string(),
-            controller: Some(true),
-            block_owner_deletion: Some(true),
-        }
-    }
-
-    fn own(&self, metadata: &mut ObjectMeta) {
-        metadata.owner_references.get_or_insert_default().push(self.owner());
-    }
-
-    fn disown(&self, metadata: &mut ObjectMeta) {
-        let owners = metadata.owner_references.get_or_insert_default();
-        owners.retain(|o| *o.uid != *self.stored.uid);
+    fn owner(&self) -> Owner<'_> {
+        Owner { context: self.context, stored: self.stored, kind: "TaskSet" }
     }
 
     fn task(&self, name: &str, change: impl FnOnce(&mut Task)) -> Result<Op, Stop> {
@@ -240,8 +227,9 @@ impl Work<'_> {
         let notes = self.set.metadata.annotations.as_ref();
         let cause = notes.and_then(|notes| notes.get(CHANGE_CAUSE));
         metadata.annotations = cause.map(|c| [(CHANGE_CAUSE.to_owned(), c.clone())].into());
-        self.own(metadata);
-        self.create(self.revision_key(name), &revision).map(|(op, _)| op)
+        self.owner().own(metadata);
+        let (op, _) = self.owner().create(self.revision_key(name), &revision)?;
+        Ok(op)
     }
 
     /// None: it is refused. Those that are not are made all the same.
@@ -254,14 +242,13 @@ impl Work<'_> {
         task.metadata.namespace = Some(self.namespace().to_owned());
         task.metadata.labels = Some(labels);
         task.metadata.annotations = Some(metadata.annotations).filter(|notes| !notes.is_empty());
-        self.own(&mut task.metadata);
-        let refusal = match self.create(self.task_key(&new.name), &task) {
+        self.owner().own(&mut task.metadata);
+        let refusal = match self.owner().create(self.task_key(&new.name), &task) {
             Ok((op, Ok(pass))) => {
                 self.passes.extend(pass);
                 return Ok(Some(op));
             }
-            Ok((_, Err(refusal))) | Err(Stop::Refused(refusal)) => refusal,
-            Err(raced) => return Err(raced),
+            Ok((_, Err(refusal))) | Err(refusal) => refusal,
         };
         self.kept_out.insert(new.name.clone(), refusal.message().to_owned());
         Ok(None)
@@ -275,17 +262,6 @@ impl Work<'_> {
         let present = self.get(&self.revision_key(revision))?;
         let revision: TaskSetRevision = objects::read(&present).ok_or(Stop::Raced)?;
         Ok(revision.spec.template)
-    }
-
-    /// A new object, and whether its namespace's quota lets it in.
-    fn create<T: serde::Serialize>(
-        &self,
-        key: Key,
-        object: &T,
-    ) -> Result<(Op, Result<Option<Pass>, Failure>), Stop> {
-        let object = prepare_object(self.context, key.resource, objects::to_value(object))?;
-        let pass = pass(self.context, key.resource, &object);
-        Ok((Op::Put { key, value: object, precondition: Precondition::Absent }, pass))
     }
 
     /// The end of a task; it passes only while its node is not locked.

@@ -12,11 +12,11 @@ fn a_row_says_what_may_move() {
     let object = json!({
         "apiVersion": "muster.dev/v1alpha1", "kind": "Application", "metadata": {"name": "corridor"},
         "spec": {"home": "youbot", "parts": [part("camera", json!(["x:Y"])), part("amcl", json!([]))]},
-        "status": {"conditions": [{"type": "Managed", "status": "False"}]},
+        "status": {"phase": "Running"},
     });
     assert_eq!(
         table(info, &[object], layout).text(&Styles::default()),
-        "NAME       HOME     PARTS   MIGRATABLE   AWAY   POLICY    MANAGED   AGE\n\
-         corridor   youbot   2       amcl         -      Optimal   False     -\n"
+        "NAME       HOME     PARTS   MIGRATABLE   AWAY   POLICY    PHASE     AGE\n\
+         corridor   youbot   2       amcl         -      Optimal   Running   -\n"
     );
 }

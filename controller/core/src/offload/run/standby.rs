@@ -1,0 +1,182 @@
+//! What a robot begins by itself when it is cut off: while a part is away, a task of it stands by at home, with its cpu and
+//! memory kept.
+//!
+//! ```text
+//!   robot cut off ──stop──▶ the controller ends what is away ──grace──▶ gone ──SLACK──▶ the robot begins the standby
+//!                   its server cut off just before that ──stop──▶ the server ends it ──grace──▶ gone ─▲
+//! ```
+//!
+//! What is away ends by the controller's word when the robot is silent, and by its own node's when that is cut off as well
+//! (`onDisconnect: Stop`). Each counts from its last contact by its own clock; heartbeats that one side knows of and the
+//! other does not are what [`SLACK`] is for. A part with actuators never comes here: it is critical.
+
+use std::time::Duration;
+
+use muster_api::kind::application::stamp;
+use muster_api::phase::TaskPhase;
+
+use super::runner::Runner;
+use super::{Action, Ending, Gathered, Look, NewTask, News};
+use crate::offload::migration::{Attempt, Event, Stage};
+use crate::offload::problem::HOME;
+use crate::taskset::after;
+
+/// For so long without contact nothing away is ended: a controller that is started again, or upgraded, is back by then.
+const BEARS: Duration = Duration::from_secs(5);
+/// Between the end of what is away and the beginning of the standby: heartbeats that only one side knows of, and clocks.
+const SLACK: Duration = Duration::from_secs(3);
+
+/// When who acts without contact, counted from the last.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Alone {
+    /// What is away is told to end.
+    pub(super) stop: Duration,
+    /// The robot begins the standby.
+    pub(super) begin: Duration,
+}
+
+impl Alone {
+    /// The standby serves before its connections' tolerance is over, where that is longer than fencing takes.
+    pub(super) fn of(patience: Option<Duration>, grace: Duration) -> Self {
+        let takes = grace + SLACK;
+        let begin = patience.unwrap_or_default().max(BEARS * 2 + takes);
+        Alone { stop: begin.saturating_sub(takes) / 2, begin }
+    }
+}
+
+impl Runner {
+    pub(super) fn alone_after(&self, look: &Look<'_>) -> Option<Alone> {
+        let part = self.spec(look)?;
+        let patience = look.model.patience(self.part?);
+        let grace = Duration::from_secs(part.template.spec.grace_period_seconds.into());
+        Some(Alone::of(patience, grace))
+    }
+
+    /// What became of the task that stands by.
+    pub(super) fn take_in_standby(&mut self, look: &Look<'_>, out: &mut Gathered) {
+        let Some(standby) = self.standby else { return };
+        let Some(task) = self.task(look, standby) else {
+            self.standby = None;
+            return;
+        };
+        if task.view.phase.is_terminal() || task.view.ending {
+            self.standby = None;
+            return self.take_away(look, standby, Ending::Over, out);
+        }
+        if task.view.attempt == 0 {
+            return;
+        }
+        // The robot has begun it.
+        self.standby = None;
+        self.explain(standby, ("Alone", "its robot was cut off, and has begun it by itself"));
+        self.happen(look, Event::CutOff { standby }, out);
+        if self.stage.map(Stage::serves) != Some(standby) {
+            return self.take_away(look, standby, Ending::NotNeeded, out);
+        }
+        self.status.moved_at = Some(stamp(look.now));
+        let (part, task) = (self.status.name.clone(), self.name_of(standby).to_owned());
+        out.news.push(News::Alone { part, task });
+    }
+
+    /// A task stands by while the part is away, and at no other time; and what is away ends in time when the robot is cut
+    /// off.
+    pub(super) fn stand_by(&mut self, look: &Look<'_>, out: &mut Gathered) {
+        let away = self.stage.filter(|stage| stage.serves().scale != HOME);
+        let wanted = away.filter(|stage| !comes_home(*stage));
+        match (wanted, self.standby) {
+            (None, Some(standby)) => {
+                self.standby = None;
+                self.take_away(look, standby, Ending::NotNeeded, out);
+            }
+            (Some(Stage::Settled { serves }), None) => self.begin_standby(look, serves, out),
+            (Some(stage), Some(standby)) => {
+                let enough = self.begins_after(look, stage.serves());
+                let begins = self.task(look, standby).and_then(|task| task.standby);
+                if self.is_outdated(look, standby) || begins < enough {
+                    self.standby = None;
+                    return self.take_away(look, standby, Ending::Outdated, out);
+                }
+                self.end_before(look, stage, standby, out);
+            }
+            (_, None) => {}
+        }
+    }
+
+    /// After how long without contact the robot may begin what stands by for a task that is away; none: that does not end
+    /// by itself.
+    fn begins_after(&self, look: &Look<'_>, away: Attempt) -> Option<Duration> {
+        let grace = self.spec(look)?.template.spec.grace_period_seconds;
+        let stop = self.task(look, away)?.view.stop_after?;
+        let surely = stop * 2 + Duration::from_secs(grace.into()) + SLACK;
+        Some(self.alone_after(look)?.begin.max(surely))
+    }
+
+    /// Ends what is away of a robot that cannot be reached and has something that stands by.
+    fn end_before(&self, look: &Look<'_>, stage: Stage, standby: Attempt, out: &mut Gathered) {
+        let placed = self.task(look, standby).is_some_and(|task| task.view.phase.holds_node());
+        let home = &look.scales.views[HOME].link;
+        if home.up || !placed {
+            return;
+        }
+        for away in [Some(stage.serves()), stage.other()].into_iter().flatten() {
+            let stop = self.task(look, away).and_then(|task| task.view.stop_after);
+            let Some(stop) = stop.filter(|_| away.scale != HOME) else { continue };
+            let due = after(home.since, stop);
+            if due > look.now {
+                out.look_at(due);
+            } else if !self.is_gone(look, away) {
+                self.take_away(look, away, Ending::RobotAlone, out);
+            }
+        }
+    }
+
+    fn begin_standby(&mut self, look: &Look<'_>, serves: Attempt, out: &mut Gathered) {
+        let Some(begin) = self.begins_after(look, serves) else { return };
+        if self.refused.is_some() || !look.home_is_there() {
+            return;
+        }
+        let standby = self.new_attempt(look, HOME, ("Standby", "stands by at home"));
+        self.standby = Some(standby);
+        out.actions.push(Action::Create(NewTask {
+            name: self.name_of(standby).to_owned(),
+            part: self.status.name.clone(),
+            node: look.scales.views[HOME].name.clone(),
+            standby: Some(begin),
+            stop_after: None,
+        }));
+    }
+
+    /// Why nothing is kept at home for the part that is away.
+    pub(super) fn not_kept(&self, look: &Look<'_>) -> Option<String> {
+        let view = &self.task(look, self.standby?)?.view;
+        let waits = view.phase == TaskPhase::Pending;
+        view.refusal.clone().filter(|_| waits)
+    }
+}
+
+/// Its next task is at home: that is what stood by.
+fn comes_home(stage: Stage) -> bool {
+    match stage {
+        Stage::Making { next, .. } | Stage::Switching { next, .. } => next.scale == HOME,
+        _ => false,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_away_has_ended_when_the_robot_begins_it() {
+        let seconds = Duration::from_secs;
+        let short = Alone::of(Some(seconds(1)), seconds(2));
+        assert_eq!(short, Alone { stop: BEARS, begin: seconds(15) });
+        let long = Alone::of(Some(seconds(65)), seconds(2));
+        assert_eq!(long, Alone { stop: seconds(30), begin: seconds(65) });
+        for (patience, grace) in [(None, 0), (Some(seconds(7)), 10), (Some(seconds(400)), 3)] {
+            let alone = Alone::of(patience, seconds(grace));
+            assert!(alone.stop * 2 + seconds(grace) + SLACK <= alone.begin, "{alone:?}");
+            assert!(alone.begin >= patience.unwrap_or_default());
+        }
+    }
+}

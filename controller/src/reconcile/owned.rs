@@ -1,0 +1,76 @@
+//! What an object controls: tasks and the like that are made with its name on them, in the transaction that writes its own
+//! status.
+
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::{ObjectMeta, OwnerReference};
+use serde::Deserialize;
+
+use crate::context::Context;
+use crate::objects;
+use crate::quota::Pass;
+use crate::rest::create::{pass, prepare_object};
+use crate::rest::failure::Failure;
+use crate::store::{Key, Op, Precondition, Stored};
+
+/// The part of an object that says whose it is.
+#[derive(Debug, Deserialize)]
+pub(super) struct Whose {
+    pub(super) metadata: ObjectMeta,
+}
+
+impl Whose {
+    /// Who controls it.
+    pub(super) fn controller(&self) -> Option<&OwnerReference> {
+        let mut owners = self.metadata.owner_references.iter().flatten();
+        owners.find(|o| o.controller == Some(true))
+    }
+}
+
+/// An object that controls others.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Owner<'a> {
+    pub(super) context: &'a Context,
+    pub(super) stored: &'a Stored,
+    /// Of the group muster.dev.
+    pub(super) kind: &'static str,
+}
+
+impl Owner<'_> {
+    pub(super) fn namespace(&self) -> &str {
+        self.stored.key.namespace().unwrap_or_default()
+    }
+
+    fn reference(&self) -> OwnerReference {
+        OwnerReference {
+            api_version: muster_api::API_VERSION.to_owned(),
+            kind: self.kind.to_owned(),
+            name: self.stored.key.name.to_string(),
+            uid: self.stored.uid.to_string(),
+            controller: Some(true),
+            block_owner_deletion: Some(true),
+        }
+    }
+
+    pub(super) fn own(&self, metadata: &mut ObjectMeta) {
+        metadata.owner_references.get_or_insert_default().push(self.reference());
+    }
+
+    pub(super) fn disown(&self, metadata: &mut ObjectMeta) {
+        let owners = metadata.owner_references.get_or_insert_default();
+        owners.retain(|o| *o.uid != *self.stored.uid);
+    }
+
+    /// A new object, and whether its namespace's quota lets it in.
+    ///
+    /// # Errors
+    ///
+    /// What a client would be told that created it.
+    pub(super) fn create<T: serde::Serialize>(
+        &self,
+        key: Key,
+        object: &T,
+    ) -> Result<(Op, Result<Option<Pass>, Failure>), Failure> {
+        let object = prepare_object(self.context, key.resource, objects::to_value(object))?;
+        let pass = pass(self.context, key.resource, &object);
+        Ok((Op::Put { key, value: object, precondition: Precondition::Absent }, pass))
+    }
+}
