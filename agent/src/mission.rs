@@ -14,6 +14,8 @@ use std::path::Path;
 
 use muster_api::id::TaskUid;
 use muster_api::kind::node::MissionLock;
+use rustix::fs::{Mode, OFlags};
+use rustix::io::Errno;
 
 use crate::checkpoint::Checkpoint;
 
@@ -40,18 +42,22 @@ pub(crate) fn locks(
     person.into_iter().chain(tasks).collect()
 }
 
-/// The beginning of a task's file, which is the task's to fill: it is a regular file or it does not count, so that a look
-/// never waits.
+/// The beginning of a task's file, which is the task's to fill: it is a regular file or it does not count. A look never waits,
+/// whatever the task makes of it meanwhile: a pipe, a link, a file that it has a lease of (`fcntl(2)`).
 pub(crate) fn text_of(path: &Path, most: u64) -> Option<String> {
-    let named = std::fs::symlink_metadata(path).ok()?;
-    if !named.is_file() {
+    let how = OFlags::RDONLY | OFlags::NOFOLLOW | OFlags::NONBLOCK | OFlags::CLOEXEC;
+    let file = match rustix::fs::open(path, how, Mode::empty()) {
+        Ok(file) => File::from(file),
+        // It is not there, or is a link.
+        Err(Errno::NOENT | Errno::NOTDIR | Errno::LOOP) => return None,
+        // Set is set, also when it cannot be read.
+        Err(_) => return Some(String::new()),
+    };
+    if !file.metadata().is_ok_and(|found| found.is_file()) {
         return None;
     }
     let mut bytes = Vec::new();
-    // Set is set, also when it cannot be read.
-    if let Ok(file) = File::open(path) {
-        let _ = file.take(most).read_to_end(&mut bytes);
-    }
+    let _ = file.take(most).read_to_end(&mut bytes);
     Some(String::from_utf8_lossy(&bytes).into_owned())
 }
 
@@ -65,6 +71,8 @@ fn read(path: &Path) -> Option<String> {
 
 #[cfg(test)]
 mod tests {
+    use std::os::fd::AsRawFd as _;
+
     use super::*;
 
     #[test]
@@ -84,5 +92,25 @@ mod tests {
         std::fs::remove_file(&path).unwrap();
         std::fs::create_dir(&path).unwrap();
         assert_eq!(read(&path), None);
+        std::fs::remove_dir(&path).unwrap();
+        let made = std::process::Command::new("mkfifo").arg(&path).status().unwrap();
+        assert!(made.success());
+        assert_eq!(read(&path), None, "nobody writes to the pipe, and nobody waits");
+    }
+
+    /// Whoever opens it in the usual way waits until the lease is given back, 45 s at most.
+    #[test]
+    fn a_file_with_a_lease_is_set_and_not_waited_for() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join(FILE);
+        std::fs::write(&path, "carries a tray\n").unwrap();
+        let held = File::open(&path).unwrap();
+        drop(File::options().write(true).open(&path).unwrap());
+        // SAFETY: a lease of a file of ours, with no pointers.
+        let got = unsafe { libc::fcntl(held.as_raw_fd(), libc::F_SETLEASE, libc::F_WRLCK) };
+        assert_eq!(got, 0, "{}", std::io::Error::last_os_error());
+        // SAFETY: the signal that says that somebody opens it would end the process.
+        unsafe { libc::signal(libc::SIGIO, libc::SIG_IGN) };
+        assert_eq!(read(&path).as_deref(), Some(""));
     }
 }

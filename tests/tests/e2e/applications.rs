@@ -167,7 +167,6 @@ async fn a_part_on_a_server_that_is_lost_comes_home_and_what_it_left_there_ends_
     let why = lost.timeline.last().expect("it has moved");
     assert_eq!((&*why.part, &*why.reason), ("ar", "Frequency"));
     assert!(why.message.contains("the link of cloud is down"), "{}", why.message);
-    assert!(!are_gone(&there), "work outlives its agent");
     let said = status(&cluster, "said that it may run on", |status| {
         status.condition("Degraded").is_some_and(|c| c.reason == "TaskUnreachable")
     })
