@@ -9,6 +9,7 @@ use muster_api::kind::application::{
 };
 
 use super::{Gathered, Look};
+use crate::offload::problem::HOME;
 use crate::offload::view::{ConnectionView, SignalView};
 use crate::taskset::after;
 
@@ -90,7 +91,13 @@ fn connection(look: &Look<'_>, c: &Connection) -> ConnectionStatus {
         from: c.from.clone(),
         to: c.to.clone(),
         hz: settled(before.and_then(|b| b.hz), hz),
-        below_since: begun(c.min_hz.is_some() && (slow || broken), since, stamp(look.now)),
+        // At home it is slow for another reason than where its ends are; to count that would fetch home at once what was moved
+        // out because of it.
+        below_since: begun(
+            c.min_hz.is_some() && ((apart && slow) || broken),
+            since,
+            stamp(look.now),
+        ),
     }
 }
 
@@ -108,10 +115,14 @@ fn signal(look: &Look<'_>, signal: &Signal) -> SignalStatus {
         signal.max.is_some_and(|max| value > max) || signal.min.is_some_and(|min| value < min)
     };
     let since = before.and_then(|b| b.outside_since.as_ref());
+    // As with connections: at home nothing can be fetched home.
+    let home = &look.scales.views[HOME].name;
+    let mut scales = look.snapshot.status.parts.iter().filter_map(|part| part.scale.as_ref());
+    let is_away = scales.any(|scale| scale != home);
     SignalStatus {
         name: signal.name.clone(),
         value: settled(before.and_then(|b| b.value), value),
-        outside_since: begun(value.is_some_and(outside), since, stamp(look.now)),
+        outside_since: begun(is_away && value.is_some_and(outside), since, stamp(look.now)),
     }
 }
 

@@ -268,7 +268,11 @@ impl Runner {
 
     /// A task at home: the one that stands by, or a new one.
     fn at_home(&mut self, look: &Look<'_>, (reason, why): (&str, &str)) -> Attempt {
-        let Some(standby) = self.standby.take() else {
+        let lives = |task: &TaskSeen| !task.view.ending && !task.view.phase.is_terminal();
+        let stands_by = |standby: &mut Attempt| {
+            self.attempts.get(&standby.uid).is_none_or(|a| look.task(&a.name).is_none_or(lives))
+        };
+        let Some(standby) = self.standby.take_if(stands_by) else {
             return self.new_attempt(look, HOME, (reason, why));
         };
         self.explain(standby, (reason, why));
@@ -279,8 +283,9 @@ impl Runner {
     fn make(&mut self, look: &Look<'_>, (serves, next): (Attempt, Attempt), out: &mut Gathered) {
         let Some(task) = self.task(look, next) else { return };
         let ready = if next.scale == HOME { Duration::ZERO } else { MIN_READY_AWAY };
+        let may_leave = next.scale == HOME || look.home_is_there();
         match health(&task.view, ready, look.now) {
-            Health::Available if !task.view.ending => {
+            Health::Available if may_leave && !task.view.ending => {
                 return self.happen(look, Event::Ready(next.uid), out);
             }
             Health::Ready { available_at } => out.look_at(available_at),
@@ -298,9 +303,11 @@ impl Runner {
     fn switch(&mut self, look: &Look<'_>, (serves, next): (Attempt, Attempt), out: &mut Gathered) {
         let ready = |task: &TaskSeen| health(&task.view, Duration::ZERO, look.now);
         let worse = self.task(look, next).filter(|t| t.view.ending || ready(t) == Health::NotReady);
-        match worse.map(|task| task.view.message.clone()) {
-            Some(message) if !self.is_gone(look, serves) => {
-                self.give_up(look, next, Abort::Failed(Fault::Crashed { message }), out);
+        let worse =
+            worse.map(|task| Abort::Failed(Fault::Crashed { message: task.view.message.clone() }));
+        match worse.or_else(|| self.left_alone(look, next)) {
+            Some(why) if !self.is_gone(look, serves) => {
+                self.give_up(look, next, why, out);
                 self.happen(look, Event::Abort, out);
             }
             _ => self.happen(look, Event::Switched(next.uid), out),
@@ -315,6 +322,9 @@ impl Runner {
         let scale = &look.scales.views[next.scale];
         if only_home(look.snapshot.spec) {
             return Some(Abort::Unwanted);
+        }
+        if let Some(why) = self.left_alone(look, next) {
+            return Some(why);
         }
         if let Some(why) = scale.unfit.clone() {
             return Some(Abort::Scale { why });
@@ -331,6 +341,12 @@ impl Runner {
         fault(&task.view, node, MAKE_WITHIN, look.now).map(Abort::Failed)
     }
 
+    /// Nothing leaves a robot that cannot be reached: what is there could not be told to end, and nothing would stand by.
+    fn left_alone(&self, look: &Look<'_>, next: Attempt) -> Option<Abort> {
+        let alone = next.scale != HOME && !look.home_is_there();
+        alone.then(|| Abort::Scale { why: "its robot is not heard".to_owned() })
+    }
+
     fn give_up(&mut self, look: &Look<'_>, next: Attempt, why: Abort, out: &mut Gathered) {
         self.status.moved_at = Some(stamp(look.now));
         let (part, to) = (self.status.name.clone(), look.scales.views[next.scale].name.clone());
@@ -341,7 +357,7 @@ impl Runner {
     /// has changed.
     fn renew(&mut self, look: &Look<'_>, part: &Part, out: &mut Gathered) {
         let Some(Stage::Settled { serves }) = self.stage else { return };
-        let Some(task) = self.task(look, serves) else { return };
+        let Some(task) = self.task(look, serves).filter(|_| !self.is_done(look)) else { return };
         let away = serves.scale != HOME;
         if task.view.ending {
             if away {
@@ -466,6 +482,7 @@ impl Runner {
         let (before, now) = (stage.serves(), step.stage.serves());
         if before.scale != now.scale {
             self.moved = true;
+            self.status.moved_at = Some(stamp(look.now));
             let message = self.attempts.get(&now.uid).map(|a| a.message.clone());
             out.news.push(News::Moved {
                 part: self.status.name.clone(),

@@ -20,11 +20,13 @@ use super::{Action, Ending, Gathered, Look, NewTask, News};
 use crate::offload::migration::{Attempt, Event, Stage};
 use crate::offload::problem::HOME;
 use crate::taskset::after;
+use crate::taskset::places::REPLACE_ENDED_AFTER;
 
 /// For so long without contact nothing away is ended: a controller that is started again, or upgraded, is back by then.
 const BEARS: Duration = Duration::from_secs(5);
-/// Between the end of what is away and the beginning of the standby: heartbeats that only one side knows of, and clocks.
-const SLACK: Duration = Duration::from_secs(3);
+/// Between the end of what is away and the beginning of the standby: heartbeats that only one side knows of (until a silence is
+/// noticed, 2 s), a controller that is started again (it counts every node as heard 3 s longer), and clocks.
+const SLACK: Duration = Duration::from_secs(8);
 
 /// When who acts without contact, counted from the last.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -59,11 +61,18 @@ impl Runner {
             self.standby = None;
             return;
         };
-        if task.view.phase.is_terminal() || task.view.ending {
+        if task.view.phase.is_terminal() {
+            // By the controller's clock it cannot have ended later than now.
+            let ended = task.view.finished.unwrap_or(task.view.created).min(look.now);
+            let due = after(ended, REPLACE_ENDED_AFTER);
+            if due > look.now {
+                return out.look_at(due);
+            }
             self.standby = None;
             return self.take_away(look, standby, Ending::Over, out);
         }
-        if task.view.attempt == 0 {
+        // One that is being ended is there until it is gone: a robot that cannot be told begins it all the same.
+        if task.view.attempt == 0 || task.view.ending {
             return;
         }
         // The robot has begun it.
@@ -82,19 +91,20 @@ impl Runner {
     /// off.
     pub(super) fn stand_by(&mut self, look: &Look<'_>, out: &mut Gathered) {
         let away = self.stage.filter(|stage| stage.serves().scale != HOME);
-        let wanted = away.filter(|stage| !comes_home(*stage));
+        if let Some(stage) = away.filter(|stage| comes_home(*stage)) {
+            // What stood by comes home: the robot may begin it, told or not.
+            stage.other().into_iter().for_each(|next| self.end_before(look, stage, next, out));
+        }
+        let wanted = away.filter(|stage| !comes_home(*stage) && !self.is_done(look));
         match (wanted, self.standby) {
-            (None, Some(standby)) => {
-                self.standby = None;
-                self.take_away(look, standby, Ending::NotNeeded, out);
-            }
+            (None, Some(standby)) => self.take_away(look, standby, Ending::NotNeeded, out),
             (Some(Stage::Settled { serves }), None) => self.begin_standby(look, serves, out),
             (Some(stage), Some(standby)) => {
                 let enough = self.begins_after(look, stage.serves());
                 let begins = self.task(look, standby).and_then(|task| task.standby);
-                if self.is_outdated(look, standby) || begins < enough {
-                    self.standby = None;
-                    return self.take_away(look, standby, Ending::Outdated, out);
+                // Who cannot be told goes by the old one.
+                if (self.is_outdated(look, standby) || begins < enough) && look.home_is_there() {
+                    self.take_away(look, standby, Ending::Outdated, out);
                 }
                 self.end_before(look, stage, standby, out);
             }
@@ -170,9 +180,9 @@ mod tests {
     fn what_is_away_has_ended_when_the_robot_begins_it() {
         let seconds = Duration::from_secs;
         let short = Alone::of(Some(seconds(1)), seconds(2));
-        assert_eq!(short, Alone { stop: BEARS, begin: seconds(15) });
+        assert_eq!(short, Alone { stop: BEARS, begin: seconds(20) });
         let long = Alone::of(Some(seconds(65)), seconds(2));
-        assert_eq!(long, Alone { stop: seconds(30), begin: seconds(65) });
+        assert_eq!(long, Alone { stop: Duration::from_millis(27_500), begin: seconds(65) });
         for (patience, grace) in [(None, 0), (Some(seconds(7)), 10), (Some(seconds(400)), 3)] {
             let alone = Alone::of(patience, seconds(grace));
             assert!(alone.stop * 2 + seconds(grace) + SLACK <= alone.begin, "{alone:?}");

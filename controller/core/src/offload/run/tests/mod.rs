@@ -249,7 +249,7 @@ fn what_stands_by_waits_long_enough_for_what_is_away_whatever_became_of_the_spec
         let standby = world.part("amcl").standby.clone().expect("one stands by").name;
         world.tasks[&standby].standby.expect("it stands by").as_secs()
     };
-    assert_eq!(begins(&world), 14);
+    assert_eq!(begins(&world), 19);
     // It is patient for longer: the robot waits for longer, and what is away ends as it was told.
     world.spec.connections[0].tolerance = muster_api::duration::Span::from_secs(40);
     world.run(2.0);

@@ -27,6 +27,9 @@ const STOP: SignedDuration = SignedDuration::from_millis(200);
 const DETECTED: SignedDuration = SignedDuration::from_secs(2);
 /// How long a part may be without a live task while its home is there: back-off, and a few steps.
 const LOST_AFTER: SignedDuration = SignedDuration::from_millis(7_000);
+/// How long what is away may run beside what runs on a robot that is silent, when it can be told to end: its `onDisconnect` and
+/// how long it takes, and a few steps.
+const TOGETHER: SignedDuration = SignedDuration::from_millis(9_000);
 
 pub(super) struct World {
     pub(super) spec: ApplicationSpec,
@@ -42,6 +45,7 @@ pub(super) struct World {
     /// Nodes without contact, and since when.
     silent: BTreeMap<String, Timestamp>,
     lost_since: BTreeMap<String, Timestamp>,
+    together_since: BTreeMap<String, Timestamp>,
     moved: BTreeMap<String, (Timestamp, String)>,
 }
 
@@ -128,6 +132,7 @@ impl World {
             real: BTreeMap::new(),
             silent: BTreeMap::new(),
             lost_since: BTreeMap::new(),
+            together_since: BTreeMap::new(),
             moved: BTreeMap::new(),
         }
     }
@@ -356,6 +361,20 @@ impl World {
                 assert!(!lost, "{} is lost: {:?} {part:#?}", part.name, self.real);
             } else {
                 self.lost_since.remove(&part.name);
+            }
+            let can_be_told = |name: &&&String| {
+                let node = &self.real[name.as_str()].node;
+                node != "robot" && !self.silent.contains_key(node)
+            };
+            // What was told to end at home, and cannot hear it, is another thing: nobody can do anything about that.
+            let ends = live.iter().any(|name| self.tasks[name.as_str()].view.ending);
+            let both = live.len() == 2 && !home_is_there && !ends;
+            if both && live.iter().any(|name| can_be_told(&name)) {
+                let since = *self.together_since.entry(part.name.clone()).or_insert(self.now);
+                let long = self.now.duration_since(since) >= TOGETHER;
+                assert!(!long, "{live:?} run beside each other in {:?}: {part:#?}", part.stage);
+            } else {
+                self.together_since.remove(&part.name);
             }
         }
         self.check_moves();
