@@ -13,6 +13,9 @@ const BESIDE: usize = 256;
 /// Bytes that wait; four of the longest messages. A reader that is further behind loses some.
 pub(super) const MOST_BYTES: usize = 4 * cost(MESSAGE_MAX);
 
+/// Answers that wait until the reader is heard again.
+const MOST_ANSWERS: usize = 1024;
+
 /// What a message of so many bytes takes while it waits.
 pub(super) const fn cost(bytes: usize) -> usize {
     bytes + BESIDE
@@ -28,14 +31,23 @@ pub(crate) struct Queue<T> {
 
 #[derive(Debug)]
 struct Waiting<T> {
-    items: VecDeque<(T, usize)>,
+    items: VecDeque<Item<T>>,
     cost: usize,
+    /// How many of them are [`Queue::push_always`]'s.
+    answers: usize,
     shut: bool,
+}
+
+#[derive(Debug)]
+struct Item<T> {
+    item: T,
+    bytes: usize,
+    answer: bool,
 }
 
 impl<T> Default for Queue<T> {
     fn default() -> Self {
-        let waiting = Waiting { items: VecDeque::new(), cost: 0, shut: false };
+        let waiting = Waiting { items: VecDeque::new(), cost: 0, answers: 0, shut: false };
         Queue { waiting: Mutex::new(waiting), more: Notify::new(), less: Notify::new() }
     }
 }
@@ -63,18 +75,19 @@ impl<T> Queue<T> {
         if waiting.cost + cost(bytes) > MOST_BYTES {
             return Err(Refused::Full);
         }
-        self.take(&mut waiting, item, bytes);
+        self.take(&mut waiting, Item { item, bytes, answer: false });
         Ok(())
     }
 
-    /// Takes an item however much waits: one that nobody may lose, and that [`Queue::room`] bounds.
+    /// Takes an answer however much waits: nobody may lose it, and [`Queue::room`] bounds how many there are.
     pub(crate) fn push_always(&self, item: T) {
-        self.take(&mut self.waiting(), item, 0);
+        self.take(&mut self.waiting(), Item { item, bytes: 0, answer: true });
     }
 
-    fn take(&self, waiting: &mut Waiting<T>, item: T, bytes: usize) {
-        waiting.cost += cost(bytes);
-        waiting.items.push_back((item, bytes));
+    fn take(&self, waiting: &mut Waiting<T>, item: Item<T>) {
+        waiting.cost += cost(item.bytes);
+        waiting.answers += usize::from(item.answer);
+        waiting.items.push_back(item);
         self.more.notify_one();
     }
 
@@ -84,8 +97,9 @@ impl<T> Queue<T> {
             let item = {
                 let mut waiting = self.waiting();
                 let next = waiting.items.pop_front();
-                next.map(|(item, bytes)| {
+                next.map(|Item { item, bytes, answer }| {
                     waiting.cost -= cost(bytes);
+                    waiting.answers -= usize::from(answer);
                     item
                 })
             };
@@ -99,9 +113,10 @@ impl<T> Queue<T> {
         }
     }
 
-    /// Ready when less than half of what may wait does. For one waiter at a time; cancel-safe.
+    /// Ready when few answers wait. Nothing else counts: who is sent more than it can read, and says something for each before it
+    /// reads the next, is heard. For one waiter at a time; cancel-safe.
     pub(crate) async fn room(&self) {
-        while self.waiting().cost > MOST_BYTES / 2 {
+        while self.waiting().answers > MOST_ANSWERS {
             self.less.notified().await;
         }
     }
@@ -110,7 +125,7 @@ impl<T> Queue<T> {
     pub(crate) fn clear(&self) {
         let mut waiting = self.waiting();
         waiting.items.clear();
-        waiting.cost = 0;
+        (waiting.cost, waiting.answers) = (0, 0);
     }
 
     /// Forgets what waits and takes no more until [`Queue::open`].
@@ -137,12 +152,25 @@ mod tests {
         assert_eq!(queue.push(1, MOST_BYTES - BESIDE), Ok(()));
         assert_eq!(queue.push(2, 0), Err(Refused::Full));
         queue.push_always(3);
-        assert!(queue.room().now_or_never().is_none());
         assert_eq!((queue.pop().await, queue.pop().await), (1, 3));
-        queue.room().await;
         assert_eq!(queue.push(4, 1), Ok(()));
         assert_eq!(queue.pop().await, 4);
         assert_eq!(queue.waiting().cost, 0);
+    }
+
+    /// A reader that answers each message before it reads the next waits for whoever reads its answers: for that it is heard
+    /// however much waits for it.
+    #[tokio::test]
+    async fn answers_alone_keep_a_reader_from_being_heard() {
+        let queue = Queue::default();
+        assert_eq!(queue.push(0, MOST_BYTES - BESIDE), Ok(()));
+        queue.room().await;
+        (0..=MOST_ANSWERS).for_each(|_| queue.push_always(1));
+        assert!(queue.room().now_or_never().is_none());
+        assert_eq!((queue.pop().await, queue.pop().await), (0, 1));
+        queue.room().await;
+        queue.clear();
+        assert_eq!((queue.waiting().cost, queue.waiting().answers), (0, 0));
     }
 
     #[test]
