@@ -10,6 +10,7 @@ use muster_api::direct::{ALPN, Line, Secret, server_name};
 use muster_sdk::{Event, Framework, Reason};
 use muster_tests::{AgentOptions, Cluster, Echo, wait};
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
+use tokio::sync::Semaphore;
 
 const LARGE: usize = 256 << 10;
 
@@ -52,13 +53,18 @@ async fn messages_go_directly_once_they_can_and_end_with_the_framework() {
         echo.round(&message).await;
     }
     let (handle, executor) = (echo.handle.clone(), echo.executor.clone());
+    // Half of what may wait for an executor is under way: of more, some could be dropped.
+    let window = Arc::new(Semaphore::new(32));
+    let may_send = Arc::clone(&window);
     let sent = tokio::spawn(async move {
         for n in 0..100 {
+            may_send.acquire().await.expect("it is open").forget();
             handle.send_framework_message(&executor, numbered(n)).await.expect("taken");
         }
     });
     for n in 0..100 {
         assert_eq!(number(&echo.answer().await), n);
+        window.add_permits(1);
     }
     sent.await.expect("all are sent");
     assert_eq!(cluster.messages().await, before, "none passed the controller");
