@@ -19,8 +19,9 @@
 //!
 //! What was refused has files of its own: who may do nothing could push what was done out of the log otherwise.
 //!
-//! What a framework's session launches, changes and ends has its lines as well, under the name of who opened the session; what
-//! agents tell of their nodes and tasks has none, and neither has what the controller does by itself.
+//! What a framework's session launches, changes and ends has its lines as well, under the name of who opened the session; those
+//! of launches come a moment after their answer, because the scheduler waits for no disk. What agents tell of their nodes and
+//! tasks has none, and neither has what the controller does by itself.
 //!
 //! A line has no bodies of objects, no query and no secrets. Reads have no lines, and neither have requests of those who did
 //! not say who they are, unless they were let in.
