@@ -7,9 +7,11 @@
 //! ```
 //!
 //! [`Identity`] is put into the extensions of every request, where REST handlers and gRPC services find it. Access objects
-//! are read anew with every request, so that a right that was taken is gone with the next one.
+//! are read anew with every request, so that a right that was taken is gone with the next one; what lasts ends soon after
+//! ([`until_revoked`]).
 
 use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
 
 use axum::extract::{Request, State};
 use axum::middleware::Next;
@@ -92,6 +94,14 @@ impl Identity {
         match name.strip_prefix(NODE_PREFIX) {
             Some(node) => Self::Node { name: node.to_owned(), key: String::new() },
             None => Self::User { name, groups, token: None },
+        }
+    }
+
+    /// Whether both are the same person or program, whatever they show: tokens are renewed.
+    pub(crate) fn is(&self, other: &Self) -> bool {
+        match (self, other) {
+            (Self::User { name, .. }, Self::User { name: other, .. }) => name == other,
+            _ => self == other,
         }
     }
 
@@ -228,6 +238,27 @@ pub(crate) fn stream<'a>(
     })
 }
 
+/// How often it is looked whether those who were let in to something that lasts may still have it.
+const LOOK_AGAIN: Duration = Duration::from_secs(2);
+
+/// Whether somebody may do this at this moment, also by what they showed: their token may have ended since.
+pub(crate) fn still_may(context: &Context, identity: &Identity, asked: &Asked<'_>) -> bool {
+    user_token::holds_for(context, identity).is_some()
+        && Asker::with(context, identity.clone()).may(asked)
+}
+
+/// Returns when a user may not do this any more: [`LOOK_AGAIN`] after the right or the token was taken back, and as soon as
+/// the token expires. Administrators and nodes have it by their certificates, which last as long as their connections.
+pub(crate) async fn until_revoked(context: &Context, identity: &Identity, asked: &Asked<'_>) {
+    if !matches!(identity, Identity::User { .. }) {
+        return std::future::pending().await;
+    }
+    while still_may(context, identity, asked) {
+        let holds = user_token::holds_for(context, identity).unwrap_or_default();
+        tokio::time::sleep(LOOK_AGAIN.min(holds)).await;
+    }
+}
+
 /// What a request asks for.
 pub(crate) fn asked(verb: Verb, target: &Target) -> Asked<'_> {
     let group = muster_api::GROUP;
@@ -304,7 +335,7 @@ pub(crate) async fn by_token(
         let identity = match identity {
             Ok(identity) => {
                 if let Some(stranger) = request.extensions().get::<Stranger>() {
-                    stranger.is_known();
+                    stranger.is_known_as(&identity.name());
                 }
                 identity
             }

@@ -1,8 +1,9 @@
 //! The one port: TLS, then HTTP/1.1 or HTTP/2, then one router for REST and gRPC.
 
+use std::collections::HashMap;
 use std::net::SocketAddr;
 use std::pin::pin;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use axum::Router;
@@ -52,6 +53,9 @@ pub(crate) struct Server {
 const HANDSHAKES: usize = 512;
 /// Connections without a certificate at once: agents that join, and who asks whether the controller lives. One more is closed.
 const STRANGERS: usize = 256;
+/// Connections that one user's tokens let in beside strangers, also those of tokens that have ended since. A fleet of one
+/// user's programs has a connection each.
+const CONNECTIONS_OF_A_USER: usize = 512;
 /// Requests at once on a connection. One client may hold a watch per kind and a log per task.
 const REQUESTS: u32 = 1024;
 /// The same of one without a certificate.
@@ -64,12 +68,14 @@ const WINDOW_OF_STRANGERS: u32 = 64 << 10;
 pub(crate) struct Limits {
     handshakes: Arc<Semaphore>,
     strangers: Arc<Semaphore>,
+    users: Arc<Users>,
 }
 
 impl Default for Limits {
     fn default() -> Self {
         let handshakes = Arc::new(Semaphore::new(HANDSHAKES));
-        Self { handshakes, strangers: Arc::new(Semaphore::new(STRANGERS)) }
+        let strangers = Arc::new(Semaphore::new(STRANGERS));
+        Self { handshakes, strangers, users: Arc::default() }
     }
 }
 
@@ -77,15 +83,79 @@ impl Default for Limits {
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Peer(pub(crate) SocketAddr);
 
-/// The place among strangers of a connection without a certificate, in the extensions of its requests.
+/// The place of a connection without a certificate, in the extensions of its requests: among strangers, until a request says
+/// by a token who they are.
 #[derive(Debug, Clone)]
-pub(crate) struct Stranger(Arc<Mutex<Option<OwnedSemaphorePermit>>>);
+pub(crate) struct Stranger {
+    place: Arc<Mutex<Place>>,
+    users: Arc<Users>,
+}
+
+#[derive(Debug)]
+enum Place {
+    /// Held for as long as it is there.
+    Stranger { _permit: OwnedSemaphorePermit },
+    /// The same.
+    User { _seat: Seat },
+}
 
 impl Stranger {
-    /// A request said who they are, by a token: who floods us with connections of strangers keeps no users out.
-    pub(crate) fn is_known(&self) {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner).take();
+    fn new(permit: OwnedSemaphorePermit, users: &Arc<Users>) -> Self {
+        let place = Arc::new(Mutex::new(Place::Stranger { _permit: permit }));
+        Self { place, users: Arc::clone(users) }
     }
+
+    /// A request said who they are: who floods us with connections of strangers keeps no users out. A user with too many
+    /// connections stays among strangers: what a token let in once, it does not hold open without bound.
+    pub(crate) fn is_known_as(&self, user: &str) {
+        let mut place = lock(&self.place);
+        if matches!(*place, Place::Stranger { .. })
+            && let Some(seat) = Users::sit(&self.users, user)
+        {
+            *place = Place::User { _seat: seat };
+        }
+    }
+}
+
+/// Connections of users by their names.
+#[derive(Debug, Default)]
+struct Users(Mutex<HashMap<String, usize>>);
+
+/// One of a user's connections.
+#[derive(Debug)]
+struct Seat {
+    users: Arc<Users>,
+    user: String,
+}
+
+impl Users {
+    /// None: the user has as many as there may be.
+    fn sit(all: &Arc<Self>, user: &str) -> Option<Seat> {
+        let mut seats = lock(&all.0);
+        let taken = seats.entry(user.to_owned()).or_default();
+        if *taken >= CONNECTIONS_OF_A_USER {
+            return None;
+        }
+        *taken += 1;
+        Some(Seat { users: Arc::clone(all), user: user.to_owned() })
+    }
+}
+
+impl Drop for Seat {
+    fn drop(&mut self) {
+        let mut seats = lock(&self.users.0);
+        if let Some(taken) = seats.get_mut(&self.user) {
+            *taken -= 1;
+            if *taken == 0 {
+                seats.remove(&self.user);
+            }
+        }
+    }
+}
+
+/// The lock of what nothing panics in half way through a change.
+fn lock<T>(of: &Mutex<T>) -> MutexGuard<'_, T> {
+    of.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 /// A connection that is counted, however it ends.
@@ -157,7 +227,7 @@ impl Server {
             true => None,
             false => {
                 let place = Arc::clone(&limits.strangers).try_acquire_owned()?;
-                Some(Stranger(Arc::new(Mutex::new(Some(place)))))
+                Some(Stranger::new(place, &limits.users))
             }
         };
         let service = hyper::service::service_fn(move |request: Request<Incoming>| {
@@ -219,4 +289,32 @@ fn builder(known: bool) -> Builder<TokioExecutor> {
         .max_frame_size(HTTP2_FRAME)
         .max_concurrent_streams(requests);
     builder
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_user_with_too_many_connections_is_a_stranger_with_the_next() {
+        let limits = Limits::default();
+        let connect = || {
+            let permit = Arc::clone(&limits.strangers).try_acquire_owned().unwrap();
+            let stranger = Stranger::new(permit, &limits.users);
+            stranger.is_known_as("ada");
+            stranger
+        };
+        let mut all: Vec<Stranger> = (0..CONNECTIONS_OF_A_USER).map(|_| connect()).collect();
+        assert_eq!(limits.strangers.available_permits(), STRANGERS);
+        all.push(connect());
+        assert_eq!(limits.strangers.available_permits(), STRANGERS - 1);
+        // Another request of a connection that has its place changes nothing.
+        all[0].is_known_as("ada");
+        all.swap_remove(0);
+        all.push(connect());
+        assert_eq!(limits.strangers.available_permits(), STRANGERS - 1);
+        drop(all);
+        assert_eq!(limits.strangers.available_permits(), STRANGERS);
+        assert!(lock(&limits.users.0).is_empty());
+    }
 }

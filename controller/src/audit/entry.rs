@@ -20,6 +20,10 @@ use crate::serve::Peer;
 
 /// What Kubernetes calls the id of a request.
 const AUDIT_ID: &str = "audit-id";
+/// In the form in which Kubernetes warns.
+const NOT_WRITTEN: HeaderValue = HeaderValue::from_static(
+    "299 - \"it was carried out, and its line in the audit log is not written\"",
+);
 
 /// The line of a request that is being carried out. Dropped before its end, it is written as one that nobody knows the
 /// outcome of: its client left, and it may have been carried out.
@@ -28,27 +32,21 @@ pub(crate) struct Entry {
     line: Option<Line>,
     /// Nobody said who they are: only what was let in is written.
     stranger: bool,
+    /// It is not carried out while lines cannot be written.
+    waits: bool,
 }
 
 impl Entry {
     /// Of a request that writes; none for others.
-    ///
-    /// # Errors
-    /// 503 while no lines can be written.
     pub(crate) fn begin(
         context: &Arc<Context>,
         asker: &Asker,
         (verb, target): (Verb, &Target),
         request: &Request<Body>,
-    ) -> Result<Option<Self>, Failure> {
+    ) -> Option<Self> {
         if !writes(verb, target) || is_dry(target, request) {
-            return Ok(None);
+            return None;
         }
-        context.audit.ready(context.clock.now()).map_err(|error| {
-            Failure::unavailable(format!(
-                "nothing is written while the audit log cannot be: {error}"
-            ))
-        })?;
         let mut line = Line {
             from: request.extensions().get::<Peer>().map(|peer| peer.0.to_string()),
             ..Line::of(&asker.identity, verb, target.resource().unwrap_or_default())
@@ -66,40 +64,56 @@ impl Entry {
             _ => {}
         }
         let stranger = asker.identity == Identity::Anonymous;
-        Ok(Some(Self { context: Arc::clone(context), line: Some(line), stranger }))
+        let (context, waits) = (Arc::clone(context), !stops(verb, target));
+        Some(Self { context, line: Some(line), stranger, waits })
     }
 
-    /// Writes the line. The answer with its id, or that the line is not written.
-    pub(crate) async fn end(mut self, answer: Answer) -> Answer {
-        let (mut line, answer) = match self.line.take() {
-            Some(line) => (line, answer),
-            None => return answer,
-        };
-        if self.stranger && answer.is_err() {
-            return answer;
+    /// Whether it may be carried out.
+    ///
+    /// # Errors
+    /// 503 while no lines can be written, unless it only stops or takes away.
+    pub(crate) async fn ready(&mut self) -> Result<(), Failure> {
+        if !self.waits {
+            return Ok(());
         }
+        let line = self.line.take();
+        self.context.audit.ready(self.context.clock.now()).await.map_err(|error| {
+            let why = format!("nothing is written while the audit log cannot be: {error}");
+            Failure::unavailable(why)
+        })?;
+        self.line = line;
+        Ok(())
+    }
+
+    /// Writes the line. The answer with its id; where the line is not written, with a warning: what was carried out is not
+    /// answered as if it were not.
+    pub(crate) async fn end(mut self, answer: Answer) -> Answer {
+        if self.stranger && answer.is_err() {
+            self.line = None;
+        }
+        let Some(mut line) = self.line.clone() else { return answer };
         line.time = self.context.clock.now();
         let answer = match answer {
             Ok(response) => Ok(self.read(&mut line, response).await),
             Err(failure) => {
                 line.code = Some(failure.code());
                 line.reason = Some(failure.reason().to_owned());
+                line.objects.extend(failure.ended().iter().cloned());
                 Err(failure)
             }
         };
-        let written = self.context.audit.write(&line);
-        match (written, answer) {
-            (Err(error), Ok(_)) => Err(Failure::unavailable(format!(
-                "it was carried out, and its line in the audit log is not written: {error}"
-            ))),
-            (_, Err(failure)) => Err(failure),
-            (Ok(()), Ok(mut response)) => {
-                if let Ok(id) = HeaderValue::from_str(&line.request_id) {
-                    response.headers_mut().insert(AUDIT_ID, id);
-                }
-                Ok(response)
-            }
+        // From here on it is queued, whoever leaves.
+        self.line = None;
+        let id = HeaderValue::from_str(&line.request_id);
+        let written = self.context.audit.write(line).await;
+        let mut response = answer?;
+        if let Ok(id) = id {
+            response.headers_mut().insert(AUDIT_ID, id);
         }
+        if written.is_err() {
+            response.headers_mut().append(header::WARNING, NOT_WRITTEN);
+        }
+        Ok(response)
     }
 
     /// What the answer says of the object.
@@ -128,8 +142,7 @@ impl Drop for Entry {
     fn drop(&mut self) {
         let Some(mut line) = self.line.take().filter(|_| !self.stranger) else { return };
         line.time = self.context.clock.now();
-        // Whoever asked is gone; that it is not written is in the log, and refuses the next write.
-        drop(self.context.audit.write(&line));
+        self.context.audit.post(line);
     }
 }
 
@@ -144,6 +157,26 @@ fn writes(verb: Verb, target: &Target) -> bool {
             | Target::Join
     );
     changes && !verb.reads()
+}
+
+/// Whether it only stops something, takes something away, or gives a robot to a person: a disk that is full is no reason to let
+/// a robot go on.
+fn stops(verb: Verb, target: &Target) -> bool {
+    let object = match target {
+        Target::Tokens(_) | Target::UserTokens(_) => return verb == Verb::Delete,
+        Target::Objects(object) => object,
+        _ => return false,
+    };
+    match (object.entry.info.kind, object.subresource) {
+        (_, Some(Subresource::Fence | Subresource::Lease(_) | Subresource::Eviction)) => true,
+        // Emergency stops and their release are in it, and `kubectl cordon`.
+        ("Node", None) => matches!(verb, Verb::Patch | Verb::Update),
+        // With the last four their tasks end, or what somebody may.
+        ("Task" | "Pod" | "TaskSet" | "Application" | "Framework" | "Access", None) => {
+            matches!(verb, Verb::Delete | Verb::DeleteCollection)
+        }
+        _ => false,
+    }
 }
 
 /// Nothing is stored of it. What knows no dry run is a write, whatever its query says.

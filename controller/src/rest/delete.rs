@@ -24,6 +24,7 @@ use super::path::Object;
 use super::registry::Entry;
 use super::selector::Selection;
 use super::{Answer, Call, body, failure::Failure, form::Form, list, metadata};
+use crate::audit::Named;
 use crate::context::Context;
 use crate::objects;
 use crate::store::{Key, Op, Resource, StoreError, Stored};
@@ -181,21 +182,36 @@ pub(super) async fn collection(call: Call, target: Object) -> Answer {
     let (of, with) = (&*context, &options);
     let end = |stored: Arc<Stored>| async move {
         match end(of, target.entry, &stored.key, with).await {
+            Ok(_) => Ok(Some(named(target.entry, &stored))),
             // Gone: somebody else was faster.
-            Err(failure) if failure.code() != 404 => Err(failure),
-            _ => Ok(()),
+            Err(failure) if failure.code() == 404 => Ok(None),
+            Err(failure) => Err(failure),
         }
     };
     // Every one is tried, and the first refusal is told.
     let mut ends = stream::iter(items.clone()).map(end).buffer_unordered(AT_ONCE);
-    let mut ended = Ok(());
+    let (mut ended, mut refused) = (Vec::new(), None);
     while let Some(one) = ends.next().await {
-        ended = ended.and(one);
+        match one {
+            Ok(one) => ended.extend(one),
+            Err(failure) => refused = refused.or(Some(failure)),
+        }
     }
     drop(ends);
-    ended?;
+    if let Some(refused) = refused {
+        return Err(refused.having_ended(ended));
+    }
     let revision = context.store.revision().to_string();
     list::answer(&context, (&revision, ""), items, (Form::Whole, target.entry)).await
+}
+
+fn named(entry: &Entry, stored: &Stored) -> Named {
+    Named {
+        kind: Some(entry.info.kind.to_owned()),
+        namespace: stored.key.namespace().map(str::to_owned),
+        name: Some(stored.key.name.to_string()),
+        uid: Some(stored.uid.to_string()),
+    }
 }
 
 async fn read(call: Call) -> Result<(Arc<Context>, Options), Failure> {

@@ -8,6 +8,7 @@ use serde_json::{Value, json};
 
 use super::path::{Object, Verb};
 use super::registry::Entry;
+use crate::audit::Named;
 use crate::store::StoreError;
 
 /// A refusal.
@@ -19,11 +20,20 @@ pub struct Failure {
     details: Value,
     /// Where a list may go on all the same.
     resume: Option<String>,
+    /// What was ended all the same.
+    ended: Option<Box<[Named]>>,
 }
 
 impl Failure {
     pub(crate) fn new(code: StatusCode, reason: &'static str, message: impl Into<String>) -> Self {
-        Self { code, reason, message: message.into(), details: Value::Null, resume: None }
+        Self {
+            code,
+            reason,
+            message: message.into(),
+            details: Value::Null,
+            resume: None,
+            ended: None,
+        }
     }
 
     /// The HTTP status.
@@ -160,6 +170,16 @@ impl Failure {
     /// Says with which `continue` the rest of a list can still be had.
     pub(crate) fn resumed_by(self, token: String) -> Self {
         Self { resume: Some(token), ..self }
+    }
+
+    /// Says what was ended before something was refused, for the audit log.
+    pub(crate) fn having_ended(self, ended: Vec<Named>) -> Self {
+        Self { ended: Some(ended.into()), ..self }
+    }
+
+    /// What was ended before something was refused.
+    pub(crate) fn ended(&self) -> &[Named] {
+        self.ended.as_deref().unwrap_or_default()
     }
 
     /// What Kubernetes says to a revision that it has not reached.

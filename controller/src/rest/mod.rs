@@ -9,7 +9,7 @@
 //! | `registry` | what is served: one entry a kind |
 //! | `discovery`, `openapi` | /api, /apis, resource lists, /version; schemas of everything |
 //! | `rendered` | changes as many watchers see them, rendered once |
-//! | `stream` | answers that last, and their places |
+//! | `stream`, `lasting` | answers that last, and their places; they end with the right to them |
 //! | `form` | whole objects, their metadata, or tables |
 //! | [`create`], `list`, `watch`, `update`, `patch`, [`delete`] | verbs on objects |
 //! | `owners`, `strategic` | server-side apply and field owners; kubectl's merge of core kinds |
@@ -48,6 +48,7 @@ mod form;
 #[cfg(test)]
 mod hostile;
 mod join;
+mod lasting;
 mod lease;
 mod list;
 pub mod log;
@@ -158,7 +159,16 @@ async fn answer(
     request: Request<Body>,
 ) -> Answer {
     let asker = Asker::of(&context, request.extensions());
-    let entry = Entry::begin(&context, &asker, (verb, &target), &request)?;
+    let mut entry = Entry::begin(&context, &asker, (verb, &target), &request);
+    if let Some(entry) = &mut entry {
+        entry.ready().await?;
+    }
+    if long && matches!(asker.identity, Identity::User { .. }) {
+        // Reads: they have no entry.
+        asker.needs(&auth::asked(verb, &target))?;
+        let lasts = lasting::Right::new(&context, &asker.identity, (verb, &target));
+        return Ok(lasts.over(admitted(context, asker, (verb, target, long), request).await?));
+    }
     let answer = match asker.needs(&auth::asked(verb, &target)) {
         Ok(()) => admitted(context, asker, (verb, target, long), request).await,
         Err(failure) => Err(failure),

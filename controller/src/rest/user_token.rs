@@ -4,6 +4,8 @@
 //! user may is what Access objects give the user's name and groups; the token itself gives nothing. It ends by itself, or when
 //! it is deleted.
 
+use std::time::Duration;
+
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
 use http::StatusCode;
@@ -196,6 +198,15 @@ pub(crate) fn identity(context: &Context, token: &str) -> Result<Identity, Strin
     Ok(Identity::User { name: user, groups, token: Some(id.to_owned()) })
 }
 
+/// How long what somebody showed goes on to hold; none: it does not. A certificate does as long as its connection.
+pub(crate) fn holds_for(context: &Context, identity: &Identity) -> Option<Duration> {
+    let Identity::User { token: Some(id), .. } = identity else { return Some(Duration::MAX) };
+    let stored = context.store.get(&Key::cluster(TOKENS, id.as_str()))?;
+    let record: Record = stored.parse().ok()?;
+    let left = record.expires.duration_since(context.clock.now());
+    Duration::try_from(left).ok().filter(|left| !left.is_zero())
+}
+
 fn unknown(id: &str) -> Failure {
     let message = format!("usertokens.{} {id:?} not found", muster_api::GROUP);
     Failure::new(StatusCode::NOT_FOUND, "NotFound", message)
@@ -233,14 +244,20 @@ mod tests {
             ada,
             Identity::User { name: "ada".into(), groups: vec!["lab".into()], token: id.clone() }
         );
+        assert_eq!(holds_for(&context, &ada), Some(Duration::from_secs(60)));
         clock.advance(59);
         assert!(identity(&context, &token).is_ok());
+        assert_eq!(holds_for(&context, &ada), Some(Duration::from_secs(1)));
         clock.advance(1);
+        assert_eq!(holds_for(&context, &ada), None);
         let why = identity(&context, &token).unwrap_err();
         assert_eq!(why, "it expired at 2026-11-22T12:01:00Z");
 
         let (token, stored) = make(&context, spec("ada", 60)).await.unwrap();
+        let again = identity(&context, &token).unwrap();
+        assert!(again.is(&ada) && again != ada, "by a newer token");
         context.store.delete(stored.key.clone(), Precondition::Any).await.unwrap();
+        assert_eq!(holds_for(&context, &again), None);
         assert!(identity(&context, &token).unwrap_err().contains("taken back"));
         // The first one is still listed, and goes when it has been over for long.
         assert_eq!(context.store.list(TOKENS, None).items.len(), 1);

@@ -1,6 +1,6 @@
 //! The audit log: a line for each write, none for reads, nothing of what was written.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use serde_json::{Value, json};
 
@@ -11,7 +11,15 @@ fn file(cluster: &Cluster) -> PathBuf {
 }
 
 fn lines(cluster: &Cluster) -> Vec<Value> {
-    let text = std::fs::read_to_string(file(cluster)).unwrap_or_default();
+    lines_of(&file(cluster))
+}
+
+fn refused(cluster: &Cluster) -> Vec<Value> {
+    lines_of(&file(cluster).with_file_name("refused.jsonl"))
+}
+
+fn lines_of(file: &Path) -> Vec<Value> {
+    let text = std::fs::read_to_string(file).unwrap_or_default();
     text.lines().map(|line| serde_json::from_str(line).unwrap()).collect()
 }
 
@@ -63,27 +71,32 @@ async fn each_write_has_a_line_and_no_read_has_one() {
     // Who says nothing fills no file.
     assert_eq!(send(&cluster.anonymous().await, "POST", TASKS, task("t")).await.0, 401);
 
-    let lines = lines(&cluster);
+    let (lines, refused) = (lines(&cluster), refused(&cluster));
+    assert_eq!(
+        refused.iter().map(brief).collect::<Vec<_>>(),
+        [
+            "admin create tasks/- default/- 409 AlreadyExists",
+            "ada create tasks/- default/- 403 Forbidden",
+        ]
+    );
     let token = made_token["metadata"]["name"].as_str().unwrap();
     assert_eq!(
         lines.iter().map(brief).collect::<Vec<_>>(),
         [
             "admin create secrets/- default/s 201 -".to_owned(),
             "admin create tasks/- default/t 201 -".to_owned(),
-            "admin create tasks/- default/- 409 AlreadyExists".to_owned(),
             "admin patch tasks/- default/t 200 -".to_owned(),
             "admin delete tasks/- default/t 200 -".to_owned(),
             "admin deletecollection tasks/- default/- 200 -".to_owned(),
             format!("admin create usertokens/- -/{token} 201 -"),
-            "ada create tasks/- default/- 403 Forbidden".to_owned(),
             "admin create transaction/- -/- 200 -".to_owned(),
         ]
     );
     assert_eq!(lines[0]["uid"], made["metadata"]["uid"]);
-    assert_eq!((&lines[1]["uid"], &lines[3]["uid"]), (&lines[4]["uid"], &lines[4]["uid"]));
-    assert_eq!((&lines[7]["token"], &lines[7]["groups"][0]), (&token.into(), &"lab".into()));
-    assert_eq!(lines[6]["objects"], json!([{"kind": "User", "name": "ada"}]));
-    assert_eq!(lines[8]["objects"][0]["name"], "together");
+    assert_eq!((&lines[1]["uid"], &lines[2]["uid"]), (&lines[3]["uid"], &lines[3]["uid"]));
+    assert_eq!((&refused[1]["token"], &refused[1]["groups"][0]), (&token.into(), &"lab".into()));
+    assert_eq!(lines[5]["objects"], json!([{"kind": "User", "name": "ada"}]));
+    assert_eq!(lines[6]["objects"][0]["name"], "together");
     assert!(lines[0]["from"].as_str().unwrap().starts_with("127.0.0.1:"));
     let text = std::fs::read_to_string(file(&cluster)).unwrap();
     for never in ["never-to-be-read", "/bin/true", "\"a\":\"b\""] {
@@ -129,5 +142,68 @@ async fn while_no_line_can_be_written_nothing_is() {
     std::fs::remove_file(&audit).unwrap();
     assert_eq!(send(&admin, "POST", TASKS, task("t")).await.0, 201);
     assert_eq!(lines(&cluster).len(), 1);
+    cluster.running.shut_down().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn what_only_stops_or_takes_away_is_done_though_no_line_can_be_written() {
+    let cluster = Cluster::start().await;
+    let admin = cluster.admin().await;
+    register(&admin, "r1").await;
+    for name in ["t", "u"] {
+        assert_eq!(send(&admin, "POST", TASKS, task(name)).await.0, 201);
+    }
+    let token = cluster.token("ada", 60).await;
+    // So that the log is opened anew.
+    let cluster = cluster.restart().await;
+    let admin = cluster.admin().await;
+    let (audit, aside) = (cluster.dir.path().join("data/audit"), cluster.dir.path().join("aside"));
+    std::fs::rename(&audit, &aside).unwrap();
+    std::fs::write(&audit, "").unwrap();
+    assert_eq!(send(&admin, "POST", TASKS, task("v")).await.0, 503);
+
+    let node = format!("{G}/nodes/r1");
+    let stop = json!({"spec": {"estop": "Cut"}}).to_string().into_bytes();
+    let request =
+        http::Request::patch(&node).header("content-type", "application/merge-patch+json");
+    let request = request.body(kube::client::Body::from(stop)).unwrap();
+    let stopped = admin.send(request).await.unwrap();
+    assert_eq!(stopped.status(), 200);
+    let warning = stopped.headers()["warning"].to_str().unwrap().to_owned();
+    assert!(warning.starts_with("299 - ") && warning.contains("not written"), "{warning}");
+    assert_eq!(get(&admin, &node).await.1["spec"]["estop"], "Cut");
+    let release = json!({"spec": {"estop": null}});
+    assert_eq!(send(&admin, "PATCH", &node, release).await.0, 200);
+    assert_eq!(send(&admin, "DELETE", &format!("{TASKS}/t"), Value::Null).await.0, 200);
+    assert_eq!(send(&admin, "DELETE", TASKS, Value::Null).await.0, 200);
+    let token = format!("{G}/usertokens/{}", token["metadata"]["name"].as_str().unwrap());
+    assert_eq!(send(&admin, "DELETE", &token, Value::Null).await.0, 200);
+    // These two are answered by what they find: nobody drives, and the node was never there.
+    for path in [format!("{G}/leases/r1/take"), format!("{node}/fence")] {
+        assert_ne!(send(&admin, "POST", &path, json!({"reason": "a test"})).await.0, 503, "{path}");
+    }
+    std::fs::remove_file(&audit).unwrap();
+    assert_eq!(send(&admin, "POST", TASKS, task("v")).await.0, 201);
+    let lines = lines(&cluster);
+    assert_eq!((lines.len(), &lines[0]["missing"]), (2, &7.into()), "{lines:?}");
+    cluster.running.shut_down().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn what_a_collection_lost_is_said_also_when_some_of_it_stayed() {
+    let cluster = Cluster::start().await;
+    let admin = cluster.admin().await;
+    for node in ["goes", "stays"] {
+        register(&admin, node).await;
+    }
+    let stop = json!({"spec": {"estop": "Cut"}});
+    assert_eq!(send(&admin, "PATCH", &format!("{G}/nodes/stays"), stop).await.0, 200);
+    let ended = send(&admin, "DELETE", &format!("{G}/nodes"), Value::Null).await;
+    assert_eq!(refusal(&ended), (409, "NodeStopped"));
+    let line = lines(&cluster).pop().unwrap();
+    assert_eq!(brief(&line), "admin deletecollection nodes/- -/- 409 NodeStopped");
+    let names: Vec<&Value> =
+        line["objects"].as_array().unwrap().iter().map(|object| &object["name"]).collect();
+    assert_eq!(names, ["goes"]);
     cluster.running.shut_down().await.unwrap();
 }

@@ -68,3 +68,71 @@ async fn a_framework_is_run_where_its_role_is() {
     );
     cluster.running.shut_down().await.unwrap();
 }
+
+/// What a session says until `wanted`.
+async fn until(body: &mut kube::client::Body, wanted: impl Fn(&Value) -> bool) -> Value {
+    let mut rest = Vec::new();
+    loop {
+        let frame = tokio::time::timeout(DEADLINE, body.frame()).await.expect("it is said");
+        let frame = frame.expect("the session goes on").unwrap();
+        rest.extend_from_slice(&frame.into_data().unwrap_or_default());
+        while let Some(end) = rest.iter().position(|byte| *byte == b'\n') {
+            let line: Vec<u8> = rest.drain(..=end).collect();
+            let event: Value = serde_json::from_slice(&line).unwrap();
+            if wanted(&event) {
+                return event;
+            }
+        }
+    }
+}
+
+async fn ends(mut body: kube::client::Body) {
+    until(&mut body, |event| event["error"]["reason"] == "Forbidden").await;
+    let end = tokio::time::timeout(DEADLINE, body.frame()).await.expect("it ends");
+    assert!(end.is_none_or(|end| end.is_err()), "nothing more is said");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_session_ends_with_the_token_or_the_right_that_opened_it() {
+    let cluster = Cluster::start().await;
+    let admin = cluster.admin().await;
+    let access = json!({
+        "apiVersion": "muster.dev/v1alpha1", "kind": "Access", "metadata": {"name": "courier"},
+        "spec": {"role": "framework", "namespaces": ["default"], "subjects": [{"name": "courier"}]},
+    });
+    assert_eq!(send(&admin, "POST", &format!("{G}/accesses"), access).await.0, 201);
+    let made = cluster.token("courier", 3600).await;
+    let courier = cluster.bearer(made["status"]["token"].as_str().unwrap()).await;
+    let (_, event, mut session) = subscribe(&courier, "default").await;
+    let subscribed = &event["subscribed"];
+    let id = subscribed["frameworkId"].as_str().unwrap().to_owned();
+    let calls =
+        format!("/framework/v1/session/{}/calls", subscribed["sessionId"].as_str().unwrap());
+
+    // Another token of the same user: the session is theirs.
+    let renewed = cluster.user("courier").await;
+    let filter = json!({"id": "1", "setFilter": {"filter": {"most": 2}}});
+    assert_eq!(send(&renewed, "POST", &calls, filter).await.0, 202);
+    until(&mut session, |event| event["answer"]["id"] == "1").await;
+    let text = std::fs::read_to_string(cluster.dir.path().join("data/audit/audit.jsonl")).unwrap();
+    let line: Value = serde_json::from_str(text.lines().last().unwrap()).unwrap();
+    assert_eq!(
+        (&line["user"], &line["verb"], &line["resource"], &line["name"]),
+        (&"courier".into(), &"update".into(), &"frameworks".into(), &"deliver".into())
+    );
+
+    // It calls nothing, and ends.
+    let token = format!("{G}/usertokens/{}", made["metadata"]["name"].as_str().unwrap());
+    assert_eq!(send(&admin, "DELETE", &token, Value::Null).await.0, 200);
+    ends(session).await;
+
+    let call = json!({"subscribe": {"name": "deliver", "namespace": "default", "frameworkId": id}});
+    let body = kube::client::Body::from(format!("{call}\n").into_bytes());
+    let request = Request::post("/framework/v1/session").body(body).unwrap();
+    let mut session = renewed.send(request).await.unwrap().into_body();
+    until(&mut session, |event| !event["subscribed"].is_null()).await;
+    let gone = send(&admin, "DELETE", &format!("{G}/accesses/courier"), Value::Null).await;
+    assert_eq!(gone.0, 200);
+    ends(session).await;
+    cluster.running.shut_down().await.unwrap();
+}

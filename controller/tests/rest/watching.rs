@@ -208,3 +208,41 @@ async fn the_kube_watcher_works_in_both_its_modes() {
     }
     cluster.running.shut_down().await.unwrap();
 }
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_watch_ends_with_the_token_or_the_right_that_opened_it() {
+    let cluster = Cluster::start().await;
+    let admin = cluster.admin().await;
+    let access = json!({
+        "apiVersion": "muster.dev/v1alpha1", "kind": "Access", "metadata": {"name": "ada"},
+        "spec": {"role": "viewer", "subjects": [{"name": "ada"}]},
+    });
+    assert_eq!(send(&admin, "POST", &format!("{G}/accesses"), access).await.0, 201);
+    send(&admin, "POST", EVENTS, event("a")).await;
+    let (made, short) = (cluster.token("ada", 3600).await, cluster.token("ada", 5).await);
+    let client =
+        async |made: &Value| cluster.bearer(made["status"]["token"].as_str().unwrap()).await;
+    let watch = async |client: &Client| {
+        let mut watch = Lines::open(client, &format!("{EVENTS}?watch=true")).await;
+        assert_eq!(watch.event().await, "ADDED a");
+        watch
+    };
+    let expires = watch(&client(&short).await).await;
+    let deleted = watch(&client(&made).await).await;
+    let denied = watch(&cluster.user("ada").await).await;
+    let mut goes_on = watch(&admin).await;
+    let ends = async |mut watch: Lines| {
+        let next = tokio::time::timeout(DEADLINE, watch.next()).await.expect("the watch ends");
+        assert_eq!(next, None);
+    };
+    ends(expires).await;
+    let token = format!("{G}/usertokens/{}", made["metadata"]["name"].as_str().unwrap());
+    assert_eq!(send(&admin, "DELETE", &token, Value::Null).await.0, 200);
+    ends(deleted).await;
+    let gone = send(&admin, "DELETE", &format!("{G}/accesses/ada"), Value::Null).await;
+    assert_eq!(gone.0, 200);
+    ends(denied).await;
+    send(&admin, "POST", EVENTS, event("b")).await;
+    assert_eq!(goes_on.event().await, "ADDED b");
+    cluster.running.shut_down().await.unwrap();
+}

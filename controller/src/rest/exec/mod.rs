@@ -21,12 +21,14 @@ use super::failure::Failure;
 use super::path::{Object, Subresource};
 use super::query::Query;
 use super::{Answer, Call, log};
+use crate::auth::Identity;
 use crate::objects;
 use crate::session::execs::{Asked, ExecError, Ready};
 
 /// Who asks for what, for the log and for those who look at the task.
 struct Visit {
-    who: String,
+    who: Identity,
+    target: Object,
     task: Task,
     ready: Ready,
     asked: Asked,
@@ -44,7 +46,7 @@ pub(super) async fn open(call: Call, target: Object) -> Answer {
     };
     let ready = live.execs.check(&task);
     let ready = ready.map_err(|error| failure(&error).about(target.entry, &key.name))?;
-    let visit = Visit { who: call.asker.identity.name(), task, ready, asked };
+    let visit = Visit { who: call.asker.identity.clone(), target, task, ready, asked };
     websocket::upgrade(call, visit)
 }
 
@@ -114,7 +116,8 @@ fn outcome(end: Option<Result<i32, String>>, node: &str) -> Value {
 
 /// Who ran what stands in the log, and under the task.
 fn tell(context: &crate::context::Context, visit: &Visit) {
-    let Visit { who, task, ready, asked } = visit;
+    let Visit { who, task, ready, asked, .. } = visit;
+    let who = who.name();
     let attach = asked.command.is_empty();
     tracing::info!(
         target: "audit",

@@ -15,11 +15,12 @@ use tokio_tungstenite::tungstenite::Message;
 use tokio_tungstenite::tungstenite::handshake::derive_accept_key;
 use tokio_tungstenite::tungstenite::protocol::frame::coding::CloseCode;
 use tokio_tungstenite::tungstenite::protocol::{CloseFrame, Role, WebSocketConfig};
-use tokio_util::sync::CancellationToken;
 
 use super::{TerminalSize, Visit, failure, outcome, switching, tell};
+use crate::auth;
 use crate::context::Context;
 use crate::rest::failure::Failure;
+use crate::rest::path::Verb;
 use crate::rest::{Answer, Call};
 use crate::session::execs::{Asked, From, Gone, Said, To};
 
@@ -121,7 +122,16 @@ async fn serve(context: &Context, socket: Socket, visit: Visit) {
             let relay =
                 Relay { asked: &visit.asked, node: visit.ready.node.as_str(), to: &opened.to };
             let mut from = opened.from;
-            match relay.run((&mut sink, &mut source), &mut from, &context.stop).await {
+            let asked = auth::of_object(Verb::Create, &visit.target);
+            let over = async {
+                tokio::select! {
+                    () = context.stop.cancelled() => Failure::unavailable("the controller ends"),
+                    () = auth::until_revoked(context, &visit.who, &asked) => {
+                        Failure::denied("the right to enter the task was taken back")
+                    }
+                }
+            };
+            match relay.run((&mut sink, &mut source), &mut from, over).await {
                 Ok(status) => status,
                 // With what is dropped here the program ends.
                 Err(Gone) => return,
@@ -155,12 +165,12 @@ impl Relay<'_> {
         &self,
         (sink, source): (&mut SplitSink<Socket, Message>, &mut SplitStream<Socket>),
         from: &mut From,
-        stop: &CancellationToken,
+        over: impl Future<Output = Failure>,
     ) -> Result<Value, Gone> {
         tokio::select! {
             status = self.outward(sink, from) => status,
             () = self.inward(source) => Err(Gone),
-            () = stop.cancelled() => Ok(Failure::unavailable("the controller ends").status()),
+            why = over => Ok(why.status()),
         }
     }
 

@@ -365,6 +365,6 @@ impl Frameworks {
 
     fn calls_of(&self, session_id: &str, who: &Identity) -> Option<mpsc::Sender<wire::Call>> {
         let uid = lock(&self.by_session).get(session_id).cloned()?;
-        lock(&self.open).get(&uid).filter(|open| *open.by == *who).map(|open| open.calls.clone())
+        lock(&self.open).get(&uid).filter(|open| open.by.is(who)).map(|open| open.calls.clone())
     }
 }

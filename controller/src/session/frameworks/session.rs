@@ -31,10 +31,10 @@ use super::{
     launch, session_in,
 };
 use crate::audit::Line;
-use crate::auth::{Asker, Identity};
+use crate::auth::{self, Asker, Identity};
 use crate::objects::{self, TASKS};
 use crate::reconcile::desk::{Outlet, Request};
-use crate::store::{Key, StoreError, Stored};
+use crate::store::{Key, StoreError};
 
 /// How long an update waits for its acknowledgement until it is said again.
 const RESEND: Duration = Duration::from_secs(10);
@@ -42,6 +42,9 @@ const RESEND: Duration = Duration::from_secs(10);
 const SUBSCRIBE_WITHIN: Duration = Duration::from_secs(10);
 /// Longest time that a decline can hold: a year, as in Mesos.
 const MAX_REFUSE: Duration = Duration::from_secs(365 * 24 * 3600);
+
+/// What a session is told whose opener lost the right to it.
+const TAKEN_BACK: &str = "the right to run this framework was taken back, or the token has ended";
 
 /// The transport's ends.
 pub(super) struct Wire {
@@ -123,6 +126,7 @@ async fn serve(frameworks: Arc<Frameworks>, wire: Wire, guest: Guest) {
     let calls = wire.keep_calls.unwrap_or_else(|| mpsc::channel(1).0);
     let direct = session.guest.direct;
     let by = Arc::clone(&session.by);
+    let whose = Arc::clone(&by);
     let open = Open { outlet: outlet.clone(), by, direct, mailbox, calls, cut: cut.clone() };
     frameworks.connect(&uid, &session_id, open);
     // After it is taken in: whoever writes that it is away looks first whether it is.
@@ -132,9 +136,17 @@ async fn serve(frameworks: Arc<Frameworks>, wire: Wire, guest: Guest) {
         return session.leave(&session_id).await;
     }
     let ended = {
+        let (context, out) = (&frameworks.context, session.out.clone());
+        let asked = session_in(key.namespace(), Some(&key.name));
+        let revoked = auth::until_revoked(context, &whose, &asked);
         let worked = pin!(session.work(&session_id, outlet, wire.calls, &mut told));
         tokio::select! {
             worked = worked => worked,
+            // Also of one that calls nothing, or does not read: with its session its tickets end.
+            () = revoked => {
+                refuse_quickly(&out, "Forbidden", TAKEN_BACK);
+                Err(Closed)
+            }
             () = cut.cancelled() => Err(Closed),
             // It is told nothing: it does not read, and may come back.
             () = slow.cancelled() => Err(Closed),
@@ -278,15 +290,14 @@ impl Session {
         let wire::Call { id, call } = call;
         let uid = Arc::clone(&self.guest.uid);
         let refusal = match call {
-            Some(Said::Accept(_) | Said::Kill(_)) if !self.still_may() => {
-                self.say(Tell::Error(wire::Error {
-                    reason: "Forbidden".to_owned(),
-                    message: "the right to run this framework was taken back".to_owned(),
-                }))
-                .await?;
+            _ if !self.still_may() => {
+                refuse_quickly(&self.out, "Forbidden", TAKEN_BACK);
                 return Err(Closed);
             }
-            Some(Said::Accept(_) | Said::Kill(_)) if !self.is_audited() => {
+            // What ends tasks or gives offers back waits for no disk.
+            Some(Said::Accept(_) | Said::SetPosition(_) | Said::SetFilter(_))
+                if !self.is_audited().await =>
+            {
                 Some(convert::unavailable())
             }
             Some(Said::Accept(accept)) => return self.accept(id, &accept).await.map(|()| false),
@@ -329,12 +340,12 @@ impl Session {
     fn still_may(&self) -> bool {
         let key = &self.guest.key;
         let asked = session_in(key.namespace(), Some(&key.name));
-        Asker::with(&self.frameworks.context, Identity::clone(&self.by)).may(&asked)
+        auth::still_may(&self.frameworks.context, &self.by, &asked)
     }
 
-    fn is_audited(&self) -> bool {
+    async fn is_audited(&self) -> bool {
         let context = &self.frameworks.context;
-        let ready = context.audit.ready(context.clock.now());
+        let ready = context.audit.ready(context.clock.now()).await;
         if let Err(error) = &ready {
             tracing::warn!(error = error as &dyn std::error::Error, framework = %self.guest.key, "nothing is written while the audit log cannot be");
         }
@@ -353,12 +364,17 @@ impl Session {
         if !violations.is_empty() {
             return Ok(Some(convert::invalid(convert::causes("", &violations))));
         }
+        let is_new = self.guest.spec != spec;
         self.guest.spec = spec.clone();
         let uid = Arc::clone(&self.guest.uid);
         let (done, rescinded) = oneshot::channel();
         self.ask(Request::Wish { uid, spec: Box::new(spec.clone()), done }).await?;
         subscribe::write_spec(&self.frameworks.context, &self.guest.key, &self.guest.uid, &spec)
             .await;
+        if is_new {
+            let Guest { key, uid, .. } = &self.guest;
+            self.write_line(Verb::Update, "frameworks", (key, uid)).await;
+        }
         // Before the answer: who has moved hears nothing of the old place after it.
         rescinded.await.map_err(|_| Closed)?;
         Ok(None)
@@ -424,7 +440,10 @@ impl Session {
         };
         let grace = kill.grace_period_seconds.map(i64::from);
         match crate::rest::delete::delete_with_grace(&self.frameworks.context, &key, grace).await {
-            Ok(stored) => self.write_line("tasks", &stored),
+            Ok(stored) => {
+                self.write_line(Verb::Delete, "tasks", (&stored.key, &stored.uid)).await;
+                None
+            }
             Err(failure) if failure.code() == 404 => None,
             Err(failure) => {
                 tracing::warn!(task = %key, error = failure.message(), "a kill is not written");
@@ -492,7 +511,10 @@ impl Session {
     async fn tear_down(&self) -> Option<wire::Refusal> {
         let context = &self.frameworks.context;
         match crate::rest::delete::delete_object(context, &self.guest.key).await {
-            Ok(stored) => self.write_line("frameworks", &stored),
+            Ok(stored) => {
+                self.write_line(Verb::Delete, "frameworks", (&stored.key, &stored.uid)).await;
+                None
+            }
             Err(failure) if failure.code() == 404 => None,
             Err(failure) => {
                 tracing::warn!(framework = %self.guest.key, error = failure.message(), "a teardown is not written");
@@ -501,18 +523,18 @@ impl Session {
         }
     }
 
-    /// The line in the audit log of an object that was ended; a refusal when it is not written.
-    fn write_line(&self, resource: &'static str, ended: &Stored) -> Option<wire::Refusal> {
+    /// The line in the audit log of what was done to an object. Where it is not written, it was done all the same.
+    async fn write_line(&self, verb: Verb, resource: &'static str, (key, uid): (&Key, &str)) {
         let context = &self.frameworks.context;
         let line = Line {
             time: context.clock.now(),
-            namespace: ended.key.namespace().map(str::to_owned),
-            name: Some(ended.key.name.to_string()),
-            uid: Some(ended.uid.to_string()),
+            namespace: key.namespace().map(str::to_owned),
+            name: Some(key.name.to_string()),
+            uid: Some(uid.to_owned()),
             code: Some(200),
-            ..Line::of(&self.by, Verb::Delete, resource)
+            ..Line::of(&self.by, verb, resource)
         };
-        context.audit.write(&line).err().map(|_| convert::unavailable())
+        drop(context.audit.write(line).await);
     }
 
     async fn leave(self, session_id: &str) {

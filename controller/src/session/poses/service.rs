@@ -52,11 +52,15 @@ impl PoseService for Service {
             .needs(&auth::stream(("poses", "stream"), None, None))
             .map_err(|failure| status_of(&failure))?;
         let (replies, outbound) = mpsc::channel(REPLIES);
-        let (poses, stop) = (Arc::clone(&self.poses), self.context.stop.clone());
+        let (poses, context) = (Arc::clone(&self.poses), Arc::clone(&self.context));
         let inbound = request.into_inner();
         self.tasks.spawn(async move {
+            let asked = auth::stream(("poses", "stream"), None, None);
             let ended = tokio::select! {
-                () = stop.cancelled() => Err(Status::unavailable("the controller ends")),
+                () = context.stop.cancelled() => Err(Status::unavailable("the controller ends")),
+                () = auth::until_revoked(&context, &asker.identity, &asked) => {
+                    Err(Status::permission_denied("the right to publish poses was taken back"))
+                }
                 // Its publisher does not listen any more; it may be gone without a word.
                 () = replies.closed() => Ok(()),
                 ended = take_all(&poses, inbound, &replies) => ended,
