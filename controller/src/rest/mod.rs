@@ -48,6 +48,7 @@ mod form;
 #[cfg(test)]
 mod hostile;
 mod join;
+mod launched;
 mod lease;
 mod list;
 pub mod log;
