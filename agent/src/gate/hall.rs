@@ -388,6 +388,7 @@ impl Hall {
             self.gives_back = None;
         }
         self.event(&Event::Granted(grant));
+        self.event(&Event::Fenced(Epoch(wanted.fence)));
         if wanted.leaves_for_ms > 0 {
             self.event(&Event::AgentLeaves { back_within_ms: wanted.leaves_for_ms.into() });
         }

@@ -88,6 +88,7 @@ impl Wanted {
             } else {
                 0
             },
+            fence: self.fence,
         }
     }
 }
@@ -355,6 +356,7 @@ mod tests {
         assert_eq!(granted(&wanted), Some((PERSON.to_owned(), 5)));
         wanted.held = false;
         assert_eq!(granted(&wanted), None, "it is nobody's: the task does not get it back");
+        assert_eq!(wanted.message().fence, 5, "the gate keeps it for an agent that forgets it");
         wanted.seats.insert(TaskUid::new("b"), seat(6));
         assert_eq!(granted(&wanted), Some(("b".to_owned(), 6)));
     }

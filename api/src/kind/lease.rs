@@ -67,8 +67,8 @@ pub struct LeaseHolder {
     /// Which of the two.
     #[serde(default, skip_serializing_if = "HolderKind::is_task")]
     pub kind: HolderKind,
-    /// The task's namespace; a person has none.
-    #[serde(default, skip_serializing_if = "String::is_empty")]
+    /// The task's namespace; empty for a person. Always written: clients that know of tasks alone require it.
+    #[serde(default)]
     pub namespace: String,
     /// The task's name, or the person's.
     pub name: String,

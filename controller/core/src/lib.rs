@@ -29,6 +29,7 @@
 //! | [`radius`] | when a robot has left the radius of a task that runs on it |
 //! | [`reschedule`] | whether a task that failed is tried on another node, and when |
 //! | [`deletion`] | when an object is to be gone that somebody deletes |
+//! | [`owner`] | whether an object is owned by another |
 //! | [`project`] | tasks and nodes as Kubernetes' Pods and Nodes |
 //! | [`recent`] | one allocation for what many nodes or tasks have in common |
 //! | [`node_health`] | when a node counts as lost |
@@ -55,6 +56,7 @@ pub mod ledger;
 pub mod node_health;
 pub mod offer;
 pub mod offload;
+pub mod owner;
 pub mod person;
 pub mod poses;
 pub mod preempt;

@@ -27,6 +27,8 @@ pub struct Robot {
     pub unfenced: Option<String>,
     /// Its agent is there.
     pub is_heard: bool,
+    /// Tasks that have not ended there were granted it: whoever holds it now, they may have its drivers still.
+    pub is_driven: bool,
 }
 
 /// What becomes of the lease.
@@ -82,10 +84,10 @@ impl fmt::Display for Refused {
             Refused::NotHolder(None) => f.write_str("nobody holds it"),
             Refused::NotFenced(why) => write!(
                 f,
-                "its holder would drive on: {why}; stop the robot (`muster estop`) or end the task"
+                "a task there would drive on: {why}; stop the robot (`muster estop`) or end the task"
             ),
             Refused::Away => f.write_str(
-                "the robot's agent is not connected, so its holder cannot be told; what drives it drives on",
+                "the robot's agent is not connected, so its task cannot be told; what drives it drives on",
             ),
         }
     }
@@ -103,17 +105,25 @@ pub fn step(
     robot: &Robot,
 ) -> Result<Outcome, Refused> {
     let mine = |holder: &LeaseHolder| holder.kind == HolderKind::User && holder.name == user;
+    // Whoever stands in the lease: a task that had it before a person runs on, and drives until its gate refuses it.
+    let takes = || match robot.is_driven {
+        true => can_be_told(robot),
+        false => Ok(()),
+    };
     match (step, &before.holder) {
-        (Step::Acquire | Step::Take, Some(holder)) if mine(holder) => Ok(Outcome::AsItWas),
+        (Step::Acquire | Step::Take, Some(holder)) if mine(holder) => {
+            takes()?;
+            Ok(Outcome::AsItWas)
+        }
         (Step::Acquire, Some(holder)) => Err(Refused::Held(holder.clone())),
-        (Step::Take, Some(holder)) => {
-            // Another person has no way to the drivers but through what they return.
-            if holder.kind == HolderKind::Task {
-                can_be_told(robot)?;
-            }
+        (Step::Take, Some(holder)) if holder.kind == HolderKind::Task => {
+            can_be_told(robot)?;
             Ok(held(user, before))
         }
-        (Step::Acquire | Step::Take, None) => Ok(held(user, before)),
+        (Step::Acquire, None) | (Step::Take, _) => {
+            takes()?;
+            Ok(held(user, before))
+        }
         (Step::Return, Some(holder)) if mine(holder) => {
             let status = LeaseStatus { holder: None, acquired: None, ..before.clone() };
             Ok(Outcome::Free { status })
@@ -163,7 +173,7 @@ mod tests {
         LeaseStatus { epoch: Epoch(epoch), holder, ..LeaseStatus::default() }
     }
 
-    const READY: Robot = Robot { unfenced: None, is_heard: true };
+    const READY: Robot = Robot { unfenced: None, is_heard: true, is_driven: false };
 
     fn held_by(outcome: Result<Outcome, Refused>) -> (u64, String, Option<LeaseHolder>) {
         match outcome {
@@ -191,7 +201,8 @@ mod tests {
         let got = held_by(step(Step::Take, "ada", &lease(4, Some(task())), &READY));
         assert_eq!(got, (5, "user ada".to_owned(), Some(task())));
         let bob = LeaseHolder::person("bob", Epoch(5));
-        let away = Robot { unfenced: Some("no driver".to_owned()), is_heard: false };
+        let away =
+            Robot { unfenced: Some("no driver".to_owned()), is_heard: false, is_driven: false };
         let got = held_by(step(Step::Take, "ada", &lease(5, Some(bob.clone())), &away));
         assert_eq!(got, (6, "user ada".to_owned(), Some(bob)));
     }
@@ -199,11 +210,34 @@ mod tests {
     #[test]
     fn nothing_is_taken_from_a_task_that_would_drive_on() {
         let taken = lease(4, Some(task()));
-        let unfenced = Robot { unfenced: Some("no driver".to_owned()), is_heard: true };
+        let unfenced =
+            Robot { unfenced: Some("no driver".to_owned()), is_heard: true, is_driven: true };
         let refused = step(Step::Take, "ada", &taken, &unfenced).unwrap_err();
         assert_eq!(refused, Refused::NotFenced("no driver".to_owned()));
-        let away = Robot { unfenced: None, is_heard: false };
+        let away = Robot { unfenced: None, is_heard: false, is_driven: true };
         assert_eq!(step(Step::Take, "ada", &taken, &away).unwrap_err(), Refused::Away);
+    }
+
+    #[test]
+    fn a_task_that_had_it_before_a_person_counts_as_long_as_it_runs() {
+        let bob = lease(5, Some(LeaseHolder::person("bob", Epoch(5))));
+        let unfenced =
+            Robot { unfenced: Some("no driver".to_owned()), is_heard: true, is_driven: true };
+        let away = Robot { unfenced: None, is_heard: false, is_driven: true };
+        for (asks, user, lease) in [
+            (Step::Take, "ada", &bob),
+            (Step::Take, "bob", &bob),
+            (Step::Acquire, "bob", &bob),
+            (Step::Acquire, "ada", &lease(5, None)),
+            (Step::Take, "ada", &lease(5, None)),
+        ] {
+            let why = step(asks, user, lease, &unfenced).unwrap_err();
+            assert_eq!(why, Refused::NotFenced("no driver".to_owned()), "{asks:?} of {user}");
+            assert_eq!(step(asks, user, lease, &away).unwrap_err(), Refused::Away);
+        }
+        let told = Robot { is_driven: true, ..READY };
+        assert_eq!(held_by(step(Step::Take, "ada", &bob, &told)).0, 6);
+        assert!(matches!(step(Step::Return, "bob", &bob, &unfenced), Ok(Outcome::Free { .. })));
     }
 
     #[test]

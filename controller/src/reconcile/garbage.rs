@@ -3,13 +3,16 @@
 //! takes it off when its condition holds.
 //!
 //! It keeps uids and references of everything in memory, fed by the store; an object goes when it
-//! names owners and none of them lives. A reference to something that never existed is as good as one
-//! to something that is gone, as in Kubernetes.
+//! names owners and none of them lives. A reference to something that never existed, or that is in
+//! another namespace, or has another name or kind, is as good as one to something that is gone, as in
+//! Kubernetes.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::Arc;
 use std::time::Duration;
 
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::OwnerReference;
+use muster_controller_core::owner::Owner;
 use serde::Deserialize;
 use serde_json::Value;
 
@@ -17,7 +20,7 @@ use super::{RETRY, next_events, watch_from_now};
 use crate::context::Context;
 use crate::objects;
 use crate::rest::delete::{delete_object, is_left_over, waits_for_others};
-use crate::rest::replacement;
+use crate::rest::{registry, replacement};
 use crate::store::{Change, Key, StoreError, Stored};
 
 const FOREGROUND: &str = "foregroundDeletion";
@@ -39,7 +42,7 @@ struct Graph {
     /// Every live object.
     live: HashMap<Box<str>, Key>,
     /// Owners of each object that has some.
-    owners: BTreeMap<Key, BTreeSet<String>>,
+    owners: BTreeMap<Key, Vec<OwnerReference>>,
     /// Objects that name each owner.
     dependents: HashMap<String, BTreeSet<Key>>,
     /// Owners whose deletion waits for this loop.
@@ -49,7 +52,7 @@ struct Graph {
 impl Graph {
     fn take_in(&mut self, change: Change, stored: &Stored) {
         for owner in self.owners.remove(&stored.key).into_iter().flatten() {
-            if let Some(keys) = self.dependents.get_mut(&owner) {
+            if let Some(keys) = self.dependents.get_mut(&owner.uid) {
                 keys.remove(&stored.key);
             }
         }
@@ -63,9 +66,9 @@ impl Graph {
         }
         self.live.insert(stored.uid.clone(), stored.key.clone());
         if stored.mentions("ownerReferences") {
-            let owners = owner_uids(stored);
+            let owners = owners_of(stored);
             for owner in &owners {
-                self.dependents.entry(owner.clone()).or_default().insert(stored.key.clone());
+                self.dependents.entry(owner.uid.clone()).or_default().insert(stored.key.clone());
             }
             if !owners.is_empty() {
                 self.owners.insert(stored.key.clone(), owners);
@@ -80,15 +83,41 @@ impl Graph {
     /// Whether the object is there and still names the owners that are known here: events may be on their way that say
     /// whom it belongs to now.
     fn is_present(&self, context: &Context, key: &Key) -> bool {
-        let present = context.store.get(key).map(|stored| owner_uids(&stored));
+        let present = context.store.get(key).map(|stored| owners_of(&stored));
         present.as_ref().is_some_and(|owners| self.owners.get(key) == Some(owners))
     }
 
     fn lost(&self, key: &Key) -> bool {
         self.owners
             .get(key)
-            .is_some_and(|owners| !owners.iter().any(|o| self.live.contains_key(o.as_str())))
+            .is_some_and(|owners| !owners.iter().any(|owner| self.is_live(owner, key)))
     }
+
+    fn is_live(&self, owner: &OwnerReference, dependent: &Key) -> bool {
+        let live = self.live.get(owner.uid.as_str());
+        live.is_some_and(|key| counts(owner, (key, &owner.uid), dependent))
+    }
+
+    /// What the object owns.
+    fn owned_by(&self, key: &Key, uid: &str) -> Vec<&Key> {
+        let is_owned = |dependent: &&Key| {
+            let mut owners = self.owners.get(*dependent).into_iter().flatten();
+            owners.any(|owner| counts(owner, (key, uid), dependent))
+        };
+        self.dependents.get(uid).into_iter().flatten().filter(is_owned).collect()
+    }
+}
+
+/// Whether a reference in `dependent` is to the object of that key and uid, by any kind that it is shown as.
+fn counts(reference: &OwnerReference, (key, uid): (&Key, &str), dependent: &Key) -> bool {
+    let mut shown = registry::all().iter().filter(|entry| entry.resource == key.resource);
+    shown.any(|entry| {
+        let api_version = entry.info.api_version();
+        let (kind, name) = (entry.info.kind, &*key.name);
+        let owner =
+            Owner { api_version: &api_version, kind, namespace: key.namespace(), name, uid };
+        owner.is_named_by(reference, dependent.namespace())
+    })
 }
 
 /// The part of an object that names its owners.
@@ -101,17 +130,12 @@ struct Belonging {
 #[serde(rename_all = "camelCase")]
 struct Belongs {
     #[serde(default)]
-    owner_references: Option<Vec<Reference>>,
+    owner_references: Option<Vec<OwnerReference>>,
 }
 
-#[derive(Deserialize)]
-struct Reference {
-    uid: Option<String>,
-}
-
-fn owner_uids(stored: &Stored) -> BTreeSet<String> {
+fn owners_of(stored: &Stored) -> Vec<OwnerReference> {
     let references = stored.parse::<Belonging>().ok().and_then(|o| o.metadata.owner_references);
-    references.into_iter().flatten().filter_map(|reference| reference.uid).collect()
+    references.into_iter().flatten().filter(|reference| !reference.uid.is_empty()).collect()
 }
 
 /// Works until dropped.
@@ -170,7 +194,7 @@ async fn finish(context: &Context, graph: &Graph, key: &Key, uid: &str) -> Resul
             .and_then(Value::as_array)
             .is_some_and(|f| f.iter().any(|x| x == name))
     };
-    let dependents: Vec<&Key> = graph.dependents.get(uid).into_iter().flatten().collect();
+    let dependents = graph.owned_by(key, uid);
     if has(ORPHAN) {
         for dependent in dependents {
             update(context, dependent, |object| remove_reference(object, uid)).await?;
@@ -249,7 +273,30 @@ mod tests {
     use serde_json::json;
 
     use super::*;
+    use crate::objects::TASK_SETS;
     use crate::store::{Op, Precondition, Resource, memory};
+
+    #[test]
+    fn an_owner_of_another_namespace_owns_nothing() {
+        let mut graph = Graph::default();
+        let mut put = |key: &Key, value: Value| {
+            let bytes = serde_json::to_vec(&value).expect("JSON").into();
+            let uid = value["metadata"]["uid"].as_str().unwrap_or_default().into();
+            graph.take_in(Change::Put, &Stored::new(key.clone(), 1, uid, bytes));
+        };
+        let set = Key::namespaced(TASK_SETS, "lab", "watch");
+        put(&set, json!({"metadata": {"name": "watch", "namespace": "lab", "uid": "s"}}));
+        let map = |ns| Key::namespaced(Resource::new("configmaps"), ns, "m");
+        for namespace in ["lab", "other"] {
+            let owner = json!([{
+                "apiVersion": muster_api::API_VERSION, "kind": "TaskSet", "name": "watch", "uid": "s",
+            }]);
+            let own = json!({"name": "m", "namespace": namespace, "uid": namespace, "ownerReferences": owner});
+            put(&map(namespace), json!({"metadata": own}));
+        }
+        assert_eq!(graph.owned_by(&set, "s"), [&map("lab")]);
+        assert!(!graph.lost(&map("lab")) && graph.lost(&map("other")));
+    }
 
     /// Its last finalizer was taken off, and it was not removed: the controller ended in between.
     #[tokio::test]

@@ -37,7 +37,7 @@ pub mod history;
 pub mod images;
 mod moves;
 pub mod orders;
-mod owned;
+pub(crate) mod owned;
 mod preempt;
 pub mod quotas;
 pub mod radius;

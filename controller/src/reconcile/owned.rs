@@ -2,6 +2,7 @@
 //! status.
 
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::{ObjectMeta, OwnerReference};
+use muster_controller_core::owner;
 use serde::Deserialize;
 
 use crate::context::Context;
@@ -18,11 +19,16 @@ pub(super) struct Whose {
 }
 
 impl Whose {
-    /// Who controls it.
+    /// Who is said to control it.
     pub(super) fn controller(&self) -> Option<&OwnerReference> {
-        let mut owners = self.metadata.owner_references.iter().flatten();
-        owners.find(|o| o.controller == Some(true))
+        owner::controller(&self.metadata)
     }
+}
+
+/// A stored object of the group muster.dev as an owner of others.
+pub(crate) fn as_owner<'a>(key: &'a Key, uid: &'a str, kind: &'a str) -> owner::Owner<'a> {
+    let (namespace, name) = (key.namespace(), &*key.name);
+    owner::Owner { api_version: muster_api::API_VERSION, kind, namespace, name, uid }
 }
 
 /// An object that controls others.
@@ -48,6 +54,18 @@ impl Owner<'_> {
             controller: Some(true),
             block_owner_deletion: Some(true),
         }
+    }
+
+    /// Whether it controls an object now. Names pass from one object to another: what a plan says of a name is done to
+    /// what the plan was made of.
+    pub(super) fn controls(&self, metadata: &ObjectMeta) -> bool {
+        as_owner(&self.stored.key, &self.stored.uid, self.kind).controls(metadata)
+    }
+
+    /// Nobody controls the object, and it is in the owner's namespace.
+    pub(super) fn may_adopt(&self, metadata: &ObjectMeta) -> bool {
+        owner::controller(metadata).is_none()
+            && metadata.namespace.as_deref() == self.stored.key.namespace()
     }
 
     pub(super) fn own(&self, metadata: &mut ObjectMeta) {

@@ -60,8 +60,9 @@ impl Belongings {
     }
 
     /// What hands everything that belongs to one task over to another.
-    fn hand_over(&self, context: &Context, from: &str, to: &str) -> Vec<Op> {
+    fn hand_over(&self, context: &Context, task: &Key, from: &str, to: &str) -> Vec<Op> {
         let keys = self.by_owner.get(from).into_iter().flatten();
+        let keys = keys.filter(|key| key.namespace() == task.namespace());
         let present = keys.filter_map(|key| context.store.get(key));
         present.filter_map(|stored| hand_over(&stored, from, to)).collect()
     }
@@ -131,7 +132,7 @@ async fn consider(context: &Context, belongings: &Belongings, key: &Key) -> Resu
                 let mut ops = vec![Op::remove(stored.key.clone(), stored.revision)];
                 ops.push(objects::create(stored.key.clone(), &next));
                 let uid = objects::uid_of(&next.metadata);
-                ops.extend(belongings.hand_over(context, &stored.uid, uid));
+                ops.extend(belongings.hand_over(context, key, &stored.uid, uid));
                 // A namespace that ends takes its tasks with it, and nothing new.
                 let namespace = stored.key.namespace().unwrap_or_default();
                 ops.extend(namespace_guard(context, TASKS, namespace).ok()?);

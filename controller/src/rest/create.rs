@@ -16,7 +16,9 @@ use super::path::Object;
 use super::query::FieldValidation;
 use super::registry::Entry;
 use super::update::Options;
-use super::{Answer, Call, admission, body, failure::Failure, metadata, namespace, together};
+use super::{
+    Answer, Call, admission, body, failure::Failure, launched, metadata, namespace, together,
+};
 use crate::context::Context;
 use crate::depends;
 use crate::objects::{self, TASKS};
@@ -39,7 +41,8 @@ pub(super) async fn create(call: Call, target: Object) -> Answer {
     let object = body::json(&parts.headers, body).await?;
     let namespace = target.namespace.as_deref();
     let with = With::default();
-    let request = New { entry: target.entry, namespace, mode, dry, owners: None, with };
+    let own = false;
+    let request = New { entry: target.entry, namespace, mode, dry, own, owners: None, with };
     let (bytes, warnings) = store_new(&context, &request, object).await?;
     Ok(with_warnings(super::raw(StatusCode::CREATED, bytes), warnings))
 }
@@ -56,6 +59,7 @@ pub(super) async fn by_application(
         namespace: target.namespace.as_deref(),
         mode: options.mode,
         dry: options.dry,
+        own: false,
         owners: object["metadata"].get("managedFields").cloned(),
         with: With::default(),
     };
@@ -84,7 +88,7 @@ fn ours(resource: Resource, namespace: Option<&str>) -> Result<New<'_>, Failure>
     let entry = super::registry::of(resource)
         .ok_or_else(|| Failure::internal(format!("{resource} is not served")))?;
     let mode = FieldValidation::Strict;
-    Ok(New { entry, namespace, mode, dry: false, owners: None, with: With::default() })
+    Ok(New { entry, namespace, mode, dry: false, own: true, owners: None, with: With::default() })
 }
 
 /// A new object as a POST would store it, without storing it.
@@ -143,7 +147,7 @@ pub(super) fn prepare_with(
     with: With<'_>,
 ) -> Result<Value, Failure> {
     let mode = FieldValidation::Strict;
-    let new = New { entry, namespace, mode, dry: false, owners: None, with };
+    let new = New { entry, namespace, mode, dry: false, own: false, owners: None, with };
     prepare(context, &new, object).map(|prepared| prepared.object)
 }
 
@@ -242,6 +246,8 @@ struct New<'a> {
     namespace: Option<&'a str>,
     mode: FieldValidation,
     dry: bool,
+    /// The controller makes it, and no client.
+    own: bool,
     /// Whose its fields are, when somebody keeps account.
     owners: Option<Value>,
     with: With<'a>,
@@ -324,6 +330,11 @@ fn prepare(context: &Context, new: &New<'_>, mut object: Value) -> Result<Prepar
     }
     let name = metadata::text(&object, "name").unwrap_or_default().to_owned();
     let mut admitted = admission::admit(new.entry, &name, object, new.mode)?;
+    if !new.own {
+        launched::check(&Value::Null, &admitted.object)
+            .into_result(())
+            .map_err(|violations| Failure::invalid(new.entry, &name, &violations))?;
+    }
     if new.entry.resource == TASKS {
         depends::check(&context.store, new.with.objects, &admitted.object)
             .map_err(|violations| Failure::invalid(new.entry, &name, &violations))?;

@@ -5,8 +5,9 @@
 //!                                                                                  └── NodeState ──▶ the answer
 //! ```
 //!
-//! A Take from a task is answered when the robot's gate has said that the person's grant counts: from then on it refuses every
-//! command of the former holder, and the robot has been stopped. The task itself runs on, without the actuators.
+//! Acquire and Take are answered when the robot's gate has said that the person's grant counts, whoever held it before: a
+//! task that was granted it once may run on and drive until then. From then on the gate refuses every command of such a task,
+//! and the robot has been stopped. The task itself runs on, without the actuators.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -15,7 +16,7 @@ use http::StatusCode;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::MicroTime;
 use muster_api::condition::{ACTUATORS_FENCED, ConditionStatus};
 use muster_api::id::Epoch;
-use muster_api::kind::lease::{DEFAULT_GROUP, HolderKind, Lease, LeaseHolder};
+use muster_api::kind::lease::{DEFAULT_GROUP, HolderKind, Lease, LeaseHolder, LeaseSpec};
 use muster_api::kind::node::Node;
 use muster_api::kind::task::Task;
 use muster_api::name::NodeName;
@@ -53,6 +54,7 @@ struct Done {
     lease: Lease,
     from: Option<LeaseHolder>,
     changed: bool,
+    robot: Robot,
 }
 
 pub(super) async fn answer(call: Call, target: Object, step: Step) -> Answer {
@@ -71,9 +73,9 @@ pub(super) async fn answer(call: Call, target: Object, step: Step) -> Answer {
         live.sessions.orders().tell_lease(&done.lease, done.stored.revision);
         tell(&context, &done, step, &word);
     }
-    // Taken twice is waited for twice: the first answer may have been lost.
-    if step == Step::Take && done.lease.spec.group == DEFAULT_GROUP {
-        wait_for_gate(&context, live, &target, &done).await?;
+    // Asked for twice is waited for twice: the first answer may have been lost.
+    if step != Step::Return && done.lease.spec.group == DEFAULT_GROUP {
+        wait_for_gate(live, &target, &done).await?;
     }
     let mut response = super::raw(StatusCode::OK, done.stored.bytes.clone());
     if let Some(from) = done.from {
@@ -106,7 +108,9 @@ async fn carry_out(
             Failure::new(StatusCode::CONFLICT, refused.reason(), message).about(entry, name)
         })?;
         let from = match outcome {
-            Outcome::AsItWas => return Ok(Done { stored, lease, from: None, changed: false }),
+            Outcome::AsItWas => {
+                return Ok(Done { stored, lease, from: None, changed: false, robot });
+            }
             Outcome::Held { mut status, from } => {
                 status.acquired = Some(MicroTime(context.clock.now()));
                 lease.status = Some(status);
@@ -124,7 +128,7 @@ async fn carry_out(
         match context.store.apply(vec![node, objects::replace(&stored, &lease)]).await {
             Ok(mut written) => {
                 let stored = written.pop().unwrap_or(stored);
-                return Ok(Done { stored, lease, from, changed: true });
+                return Ok(Done { stored, lease, from, changed: true, robot });
             }
             Err(error) if objects::is_race(&error) => {
                 if context.store.get(&objects::node_key(&lease.spec.node)).is_none() {
@@ -151,22 +155,33 @@ fn robot(context: &Context, live: &Live, lease: &Lease) -> Robot {
         None => Some("no gate stands before its drivers".to_owned()),
     };
     let is_heard = NodeName::new(name).is_ok_and(|name| live.sessions.is_heard(&name));
-    Robot { unfenced, is_heard }
+    Robot { unfenced, is_heard, is_driven: is_driven(context, lease) }
+}
+
+/// Whether a task that has not ended on its node was granted the lease once, held or taken since.
+fn is_driven(context: &Context, lease: &Lease) -> bool {
+    let node = lease.spec.node.as_str();
+    let name = LeaseSpec::object_name(node, &lease.spec.group);
+    let tasks = context.store.list(TASKS, None).items;
+    let mut there = tasks.iter().filter(|stored| stored.mentions(&name));
+    there.any(|stored| {
+        let status = objects::read::<Task>(stored).and_then(|task| task.status);
+        status.is_some_and(|status| {
+            status.node.as_deref() == Some(node)
+                && status.phase.holds_node()
+                && status.lease.is_some_and(|lease| lease.name == name)
+        })
+    })
 }
 
 /// Returns when the gate has said that the person's grant counts.
-async fn wait_for_gate(
-    context: &Context,
-    live: &Live,
-    target: &Object,
-    done: &Done,
-) -> Result<(), Failure> {
+async fn wait_for_gate(live: &Live, target: &Object, done: &Done) -> Result<(), Failure> {
     let status = done.lease.status.clone().unwrap_or_default();
     let Ok(node) = NodeName::new(done.lease.spec.node.clone()) else { return Ok(()) };
-    // Nobody drove it who could drive on.
-    let from_task = done.from.as_ref().is_some_and(|from| from.kind == HolderKind::Task);
-    let again = !done.changed && robot(context, live, &done.lease).unfenced.is_none();
-    if !from_task && !again {
+    let Robot { unfenced, is_heard, is_driven } = &done.robot;
+    let has_gate = unfenced.is_none() && *is_heard;
+    // Without a gate, or while it is away, nobody got this far whom a task could drive against.
+    if !has_gate && !is_driven {
         return Ok(());
     }
     let told = live.sessions.person_counts(&node, status.epoch);
@@ -175,7 +190,7 @@ async fn wait_for_gate(
     }
     let name = done.stored.key.name.as_ref();
     Err(Failure::timeout(format!(
-        "lease {name:?} is yours (epoch {}), but {node} has not said in {} s that its former holder is refused: take it for one that \
+        "lease {name:?} is yours (epoch {}), but {node} has not said in {} s that everybody else is refused: take it for one that \
          moves, and ask again",
         status.epoch,
         TOLD_WITHIN.as_secs()

@@ -49,6 +49,7 @@ mod form;
 mod hostile;
 mod join;
 mod lasting;
+mod launched;
 mod lease;
 mod list;
 pub mod log;

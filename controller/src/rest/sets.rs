@@ -18,6 +18,7 @@ use serde_json::{Value, json};
 use super::failure::Failure;
 use crate::context::Context;
 use crate::objects::{self, NODES, REVISIONS, TASK_SETS, TASKS};
+use crate::reconcile::owned::as_owner;
 use crate::reconcile::taskset::spec_at;
 use crate::store::{Key, Store, Stored};
 
@@ -92,7 +93,10 @@ pub(super) fn outcome(context: &Context, object: &Value) -> Result<(Value, Vec<D
 fn there(store: &Store, (namespace, name): (&str, &str), uid: &str, set: &TaskSet) -> There {
     let selector = set.spec.selects(name);
     let all = store.list(TASKS, Some(namespace)).items;
-    let views = all.iter().filter_map(|s| TaskView::of(&objects::read::<Task>(s)?, uid, &selector));
+    let key = Key::namespaced(TASK_SETS, namespace, name);
+    let owner = as_owner(&key, uid, "TaskSet");
+    let views =
+        all.iter().filter_map(|s| TaskView::of(&objects::read::<Task>(s)?, &owner, &selector));
     let tasks: Vec<TaskView> = views.collect();
     let prefix = format!("{name}-");
     let others = all.iter().map(|stored| stored.key.name.to_string());
@@ -105,7 +109,7 @@ fn there(store: &Store, (namespace, name): (&str, &str), uid: &str, set: &TaskSe
         |s: Arc<Stored>| Some((s.key.name.to_string(), NodeView::of(&objects::read::<Node>(&s)?)));
     There {
         taken: others.collect(),
-        revisions: of_set.filter_map(|revision| RevisionView::of(&revision, uid)).collect(),
+        revisions: of_set.filter_map(|revision| RevisionView::of(&revision, &owner)).collect(),
         nodes: nodes.filter_map(node).collect(),
         tasks,
     }

@@ -19,7 +19,7 @@ use super::owners::Writer;
 use super::path::{Object, Subresource};
 use super::query::FieldValidation;
 use super::registry::{Entry, View};
-use super::{Answer, Call, admission, body, failure::Failure, metadata, owners};
+use super::{Answer, Call, admission, body, failure::Failure, launched, metadata, owners};
 use crate::context::Context;
 use crate::store::{Op, Precondition, Store, StoreError, Stored};
 
@@ -190,6 +190,9 @@ fn next(
     }
     let mut admitted = admission::admit(entry, name, new, options.mode)?;
     kind::admit_change(entry.info, &old, &admitted.object)
+        .map_err(|violations| Failure::invalid(entry, name, &violations))?;
+    launched::check(&old, &admitted.object)
+        .into_result(())
         .map_err(|violations| Failure::invalid(entry, name, &violations))?;
     check_finalizers(entry, name, &old, &admitted.object)?;
     metadata::count(&old, &mut admitted.object);

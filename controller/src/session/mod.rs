@@ -301,6 +301,8 @@ impl Sessions {
         if connections.get(node).is_some_and(|c| c.id == id) {
             connections.remove(node);
             lock(&self.usage).remove(node);
+            // Its gate may have been started anew before it is heard again; the next session says what counts then.
+            self.set_person_epoch(node, 0);
         }
     }
 }

@@ -88,6 +88,9 @@ impl Default for Settings {
 pub enum Event {
     /// The agent says whose the robot is: all that counts, said at the start of each connection and at each change.
     Granted(Option<Grant>),
+    /// What was granted before this number never counts again, whether somebody holds the robot or not. Said after
+    /// the grant that counts: one with this number is the person's.
+    Fenced(Epoch),
     /// The agent is going down in order, and back within this time, milliseconds.
     AgentLeaves {
         /// At most so long is the robot without it.
@@ -298,6 +301,7 @@ impl Gate {
         self.pass_time(now, &mut effects);
         match event {
             Event::Granted(grant) => self.granted(grant.as_ref(), &mut effects),
+            Event::Fenced(fence) => self.fenced(*fence, &mut effects),
             Event::AgentLeaves { back_within_ms } => {
                 if self.grip == Grip::Held {
                     self.grip = Grip::Until(now.plus(*back_within_ms));
@@ -433,6 +437,21 @@ impl Gate {
             effects.push(Effect::Keep(self.kept.clone()));
         }
         effects.push(Effect::Report);
+    }
+
+    /// Durable like a grant: the agent may forget it, and a gate that is started again must not.
+    fn fenced(&mut self, fence: Epoch, effects: &mut Vec<Effect>) {
+        if fence <= self.kept.newest.epoch {
+            return;
+        }
+        if let Some(before) = self.grant.take() {
+            self.former = Some(before);
+            self.delegates.clear();
+            self.alive = None;
+            self.stop(StopReason::Revoked, effects);
+        }
+        self.kept.newest = Token::root(fence);
+        effects.extend([Effect::Keep(self.kept.clone()), Effect::Report]);
     }
 
     fn agent_gone(&mut self, now: Boot, effects: &mut Vec<Effect>) {

@@ -200,6 +200,33 @@ fn an_emergency_stop_is_before_everything() {
     assert_eq!(verdict(&mut gate, B, "7"), Verdict::Ok);
 }
 
+/// A person took the robot and returned it; the agent is started again and seats the task that drove before.
+#[test]
+fn what_was_granted_before_a_fence_does_not_come_back_with_an_agent_that_forgot_it() {
+    let mut gate = gate();
+    assert_eq!(verdict(&mut gate, A, "6"), Verdict::Ok);
+    let response = gate.handle(&Event::Fenced(Epoch(7)), Boot(1));
+    let kept = Kept { newest: token("7"), estop: EStop::default() };
+    let stopped = Effect::Stop(StopReason::Revoked);
+    assert_eq!(response.effects, [stopped, Effect::Keep(kept.clone()), Effect::Report]);
+    assert_eq!(verdict(&mut gate, A, "6"), Verdict::Revoked);
+    for event in [Event::AgentGone, grant(6, "a"), Event::Fenced(Epoch(0))] {
+        let _ = gate.handle(&event, Boot(2));
+    }
+    assert_ne!(verdict(&mut gate, A, "6"), Verdict::Ok);
+    // Nor at a gate that was started again.
+    let (mut gate, _) = Gate::start(Settings::default(), kept);
+    for event in [Event::Opened(A, uid("a")), grant(6, "a")] {
+        let _ = gate.handle(&event, Boot(3));
+    }
+    assert_ne!(verdict(&mut gate, A, "6"), Verdict::Ok);
+    // The person's own grant has the number, and is said before the fence.
+    for event in [Event::Opened(B, uid("person")), grant(7, "person"), Event::Fenced(Epoch(7))] {
+        let _ = gate.handle(&event, Boot(4));
+    }
+    assert_eq!(verdict(&mut gate, B, "7"), Verdict::Ok);
+}
+
 /// Anything that may happen, in any order.
 fn events() -> impl Strategy<Value = Event> {
     let task = || (0..3_u8).prop_map(|n| uid(&n.to_string()));
@@ -213,6 +240,7 @@ fn events() -> impl Strategy<Value = Event> {
     prop_oneof![
         3 => (1..6_u64, task()).prop_map(|(epoch, holder)| Event::Granted(Some(Grant { epoch: Epoch(epoch), holder }))),
         1 => Just(Event::Granted(None)),
+        1 => (0..6_u64).prop_map(|fence| Event::Fenced(Epoch(fence))),
         1 => (0..500_u64).prop_map(|back_within_ms| Event::AgentLeaves { back_within_ms }),
         1 => Just(Event::AgentGone),
         3 => (conn(), task()).prop_map(|(conn, task)| Event::Opened(conn, task)),

@@ -13,6 +13,7 @@ use muster_api::phase::TaskPhase;
 use muster_api::selector::LabelSelector;
 
 use crate::cluster::NodeFacts;
+use crate::owner::{self, Owner};
 
 /// Whose a task is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -75,14 +76,13 @@ pub struct TaskView {
 impl TaskView {
     /// The view that a set has of a task; none: it is no business of the set's.
     #[must_use]
-    pub fn of(task: &Task, set_uid: &str, selector: &LabelSelector) -> Option<Self> {
+    pub fn of(task: &Task, set: &Owner<'_>, selector: &LabelSelector) -> Option<Self> {
         let labels = task.metadata.labels.clone().unwrap_or_default();
-        let owners = task.metadata.owner_references.iter().flatten();
-        let controller = owners.clone().find(|o| o.controller == Some(true));
-        let claim = match controller {
-            Some(owner) if owner.uid == set_uid && selector.matches(&labels) => Claim::Mine,
-            Some(owner) if owner.uid == set_uid => Claim::NoLongerMine,
-            None if selector.matches(&labels) => Claim::Nobodys,
+        let is_nobodys = owner::controller(&task.metadata).is_none();
+        let claim = match (set.controls(&task.metadata), selector.matches(&labels)) {
+            (true, true) => Claim::Mine,
+            (true, false) => Claim::NoLongerMine,
+            (false, true) if is_nobodys => Claim::Nobodys,
             _ => return None,
         };
         let status = task.status.clone().unwrap_or_default();
@@ -181,13 +181,11 @@ pub struct RevisionView {
 impl RevisionView {
     /// The view that a set has of a revision; none: it is another's.
     #[must_use]
-    pub fn of(revision: &TaskSetRevision, set_uid: &str) -> Option<Self> {
-        let mut owners = revision.metadata.owner_references.iter().flatten();
-        let mine = match owners.find(|o| o.controller == Some(true)) {
-            Some(owner) if owner.uid == set_uid => true,
-            Some(_) => return None,
-            None => false,
-        };
+    pub fn of(revision: &TaskSetRevision, set: &Owner<'_>) -> Option<Self> {
+        let mine = set.controls(&revision.metadata);
+        if !mine && owner::controller(&revision.metadata).is_some() {
+            return None;
+        }
         Some(RevisionView {
             name: revision.metadata.name.clone()?,
             number: revision.spec.revision,

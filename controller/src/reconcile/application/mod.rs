@@ -22,6 +22,7 @@ use muster_api::kind::task::Task;
 use muster_controller_core::offload::run::view::TaskSeen;
 use muster_controller_core::offload::run::{Snapshot, plan};
 
+use super::owned::as_owner;
 use super::{again, next_events, watch_from_now};
 use crate::context::Context;
 use crate::objects::{self, APPLICATIONS, TASKS};
@@ -150,10 +151,11 @@ fn tasks(
     status: &ApplicationStatus,
 ) -> BTreeMap<String, TaskSeen> {
     let namespace = stored.key.namespace().unwrap_or_default();
+    let owner = as_owner(&stored.key, &stored.uid, "Application");
     let named = status.parts.iter().flat_map(|part| part.tasks());
     let read = |name: &String| {
         let task = context.store.get(&Key::namespaced(TASKS, namespace, name.as_str()))?;
-        TaskSeen::of(&objects::read::<Task>(&task)?, &stored.uid)
+        TaskSeen::of(&objects::read::<Task>(&task)?, &owner)
     };
     named.filter_map(|task| Some((task.name.clone(), read(&task.name)?))).collect()
 }

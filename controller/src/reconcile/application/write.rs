@@ -104,6 +104,8 @@ impl Work<'_> {
                 Action::Delete { task, .. } => {
                     let present = self.owner.context.store.get(&self.key(task));
                     let present = present.ok_or(Stop::Raced)?;
+                    let task: Task = objects::read(&present).ok_or(Stop::Raced)?;
+                    self.is_ours(&task)?;
                     ops.push(delete::operation(self.owner.context.clock.now(), &present));
                 }
             }
@@ -123,9 +125,15 @@ impl Work<'_> {
         Key::namespaced(TASKS, self.owner.namespace(), task)
     }
 
+    /// Names pass from one object to another.
+    fn is_ours(&self, task: &Task) -> Result<(), Stop> {
+        if self.owner.controls(&task.metadata) { Ok(()) } else { Err(Stop::Raced) }
+    }
+
     fn release(&self, name: &str) -> Result<Op, Stop> {
         let present = self.owner.context.store.get(&self.key(name)).ok_or(Stop::Raced)?;
         let mut task: Task = objects::read(&present).ok_or(Stop::Raced)?;
+        self.is_ours(&task)?;
         task.spec.standby = None;
         task.metadata.generation = task.metadata.generation.map(|generation| generation + 1);
         Ok(objects::replace(&present, &task))

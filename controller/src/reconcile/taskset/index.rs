@@ -170,7 +170,9 @@ impl Index {
         let first = Key::namespaced(TASKS, namespace, "");
         let loose = self.loose.range(first..).take_while(|(k, _)| k.namespace() == Some(namespace));
         let loose = loose.filter(|(_, labels)| selector.matches(labels)).map(|(key, _)| key);
-        self.controlled.get(uid).into_iter().flatten().chain(loose).cloned().collect()
+        // Who is named as an owner by an object of another namespace is not.
+        let own = self.controlled.get(uid).into_iter().flatten();
+        own.filter(|key| key.namespace() == Some(namespace)).chain(loose).cloned().collect()
     }
 
     /// Names that begin as those of a set's tasks do and belong to other tasks. The index may still know a task that is
@@ -212,5 +214,27 @@ mod tests {
         let taken: Vec<String> = index.names(&set, &[], |_| true).into_iter().collect();
         assert_eq!(taken, ["watch-0"]);
         assert!(index.names(&set, &[], |_| false).is_empty());
+    }
+
+    /// The set would delete what has the same name in its own namespace.
+    #[test]
+    fn a_task_of_another_namespace_is_none_of_the_set_that_it_names() {
+        let owner = json!([{
+            "apiVersion": muster_api::API_VERSION, "kind": "TaskSet", "name": "watch", "uid": "s", "controller": true,
+        }]);
+        let mut index = Index::default();
+        for namespace in ["lab", "other"] {
+            let object = json!({
+                "apiVersion": muster_api::API_VERSION, "kind": "Task",
+                "metadata": {"name": "watch-0", "namespace": namespace, "ownerReferences": owner},
+                "spec": {"run": {"process": {"command": ["true"]}}},
+            });
+            let bytes = serde_json::to_vec(&object).expect("JSON").into();
+            let key = Key::namespaced(TASKS, namespace, "watch-0");
+            index.take_in(Change::Put, &Arc::new(Stored::new(key, 1, "u".into(), bytes)));
+        }
+        let tasks: Vec<Key> =
+            index.tasks_of("s", "lab", &LabelSelector::default()).into_iter().collect();
+        assert_eq!(tasks, [Key::namespaced(TASKS, "lab", "watch-0")]);
     }
 }

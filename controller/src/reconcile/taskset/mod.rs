@@ -24,6 +24,7 @@ use muster_api::kind::taskset_revision::TaskSetRevision;
 use muster_controller_core::taskset::view::{RevisionView, TaskView};
 use muster_controller_core::taskset::{Snapshot, plan};
 
+use super::owned::as_owner;
 use super::{again, next_events, watch_from_now};
 use crate::context::Context;
 use crate::objects::{self, NODES, QUOTAS, REVISIONS};
@@ -151,19 +152,21 @@ async fn look(context: &Context, index: &Index, key: &Key) -> Result<Next, Store
 }
 
 fn revisions(context: &Context, set: &Stored, name: &str) -> Vec<RevisionView> {
+    let owner = as_owner(&set.key, &set.uid, "TaskSet");
     let all = context.store.list(REVISIONS, set.key.namespace()).items.into_iter();
     let of_set = all.filter(|s| s.mentions(name)).filter_map(|s| objects::read(&s));
     let named = of_set.filter(|r: &TaskSetRevision| {
         let labels = r.metadata.labels.as_ref();
         labels.and_then(|l| l.get(muster_api::kind::taskset::SET_LABEL)).is_some_and(|n| n == name)
     });
-    named.filter_map(|revision| RevisionView::of(&revision, &set.uid)).collect()
+    named.filter_map(|revision| RevisionView::of(&revision, &owner)).collect()
 }
 
 fn tasks(context: &Context, index: &Index, stored: &Stored, set: &TaskSet) -> Vec<TaskView> {
     let selector = set.spec.selects(&stored.key.name);
     let keys = index.tasks_of(&stored.uid, stored.key.namespace().unwrap_or_default(), &selector);
     let present = keys.iter().filter_map(|key| context.store.get(key));
-    let views = present.filter_map(|s| TaskView::of(&objects::read(&s)?, &stored.uid, &selector));
+    let owner = as_owner(&stored.key, &stored.uid, "TaskSet");
+    let views = present.filter_map(|s| TaskView::of(&objects::read(&s)?, &owner, &selector));
     views.collect()
 }

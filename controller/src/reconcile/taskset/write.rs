@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use jiff::Timestamp;
-use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::{ObjectMeta, Time};
 use muster_api::condition::{Condition, ConditionStatus, REPLICA_FAILURE, set_condition};
 use muster_api::kind::node::Node;
 use muster_api::kind::task::{Task, TaskSpec};
@@ -146,20 +146,37 @@ impl Work<'_> {
                     ops.push(self.new_revision(name, *number)?);
                 }
                 Action::Renumber { name, number } => {
-                    ops.push(self.revision(name, |revision| revision.spec.revision = *number)?);
+                    ops.push(self.revision(name, |revision| {
+                        revision.spec.revision = *number;
+                        !self.is_anothers(&revision.metadata)
+                    })?);
                 }
                 Action::AdoptRevision { name } => {
-                    ops.push(self.revision(name, |r| self.owner().own(&mut r.metadata))?);
+                    ops.push(self.revision(name, |r| {
+                        let may = self.owner().may_adopt(&r.metadata);
+                        self.owner().own(&mut r.metadata);
+                        may
+                    })?);
                 }
                 Action::DeleteRevision { name } => {
                     let present = self.get(&self.revision_key(name))?;
+                    let revision: TaskSetRevision = objects::read(&present).ok_or(Stop::Raced)?;
+                    if self.is_anothers(&revision.metadata) {
+                        return Err(Stop::Raced);
+                    }
                     ops.push(Op::remove(present.key.clone(), present.revision));
                 }
-                Action::Adopt { task } => {
-                    ops.push(self.task(task, |t| self.owner().own(&mut t.metadata))?)
-                }
+                Action::Adopt { task } => ops.push(self.task(task, |t| {
+                    let may = self.owner().may_adopt(&t.metadata);
+                    self.owner().own(&mut t.metadata);
+                    may
+                })?),
                 Action::Release { task } => {
-                    ops.push(self.task(task, |t| self.owner().disown(&mut t.metadata))?);
+                    ops.push(self.task(task, |t| {
+                        let is_ours = self.owner().controls(&t.metadata);
+                        self.owner().disown(&mut t.metadata);
+                        is_ours
+                    })?);
                 }
                 Action::Create(new) => {
                     let made = self.new_task(new, plan)?;
@@ -202,17 +219,36 @@ impl Work<'_> {
         Owner { context: self.context, stored: self.stored, kind: "TaskSet" }
     }
 
-    fn task(&self, name: &str, change: impl FnOnce(&mut Task)) -> Result<Op, Stop> {
+    /// Names pass from one object to another: only what the set controls is ended.
+    fn is_ours(&self, metadata: &ObjectMeta) -> Result<(), Stop> {
+        if self.owner().controls(metadata) { Ok(()) } else { Err(Stop::Raced) }
+    }
+
+    /// Neither the set's nor to be taken in by it.
+    fn is_anothers(&self, metadata: &ObjectMeta) -> bool {
+        !self.owner().controls(metadata) && !self.owner().may_adopt(metadata)
+    }
+
+    /// Changed, unless `change` says that it is another's.
+    fn task(&self, name: &str, change: impl FnOnce(&mut Task) -> bool) -> Result<Op, Stop> {
         let present = self.get(&self.task_key(name))?;
         let mut task: Task = objects::read(&present).ok_or(Stop::Raced)?;
-        change(&mut task);
+        if !change(&mut task) {
+            return Err(Stop::Raced);
+        }
         Ok(objects::replace(&present, &task))
     }
 
-    fn revision(&self, name: &str, change: impl FnOnce(&mut TaskSetRevision)) -> Result<Op, Stop> {
+    fn revision(
+        &self,
+        name: &str,
+        change: impl FnOnce(&mut TaskSetRevision) -> bool,
+    ) -> Result<Op, Stop> {
         let present = self.get(&self.revision_key(name))?;
         let mut revision: TaskSetRevision = objects::read(&present).ok_or(Stop::Raced)?;
-        change(&mut revision);
+        if !change(&mut revision) {
+            return Err(Stop::Raced);
+        }
         Ok(objects::replace(&present, &revision))
     }
 
@@ -268,6 +304,7 @@ impl Work<'_> {
     fn deletion(&self, name: &str) -> Result<Vec<Op>, Stop> {
         let present = self.get(&self.task_key(name))?;
         let task: Task = objects::read(&present).ok_or(Stop::Raced)?;
+        self.is_ours(&task.metadata)?;
         let mut ops = vec![delete::operation(self.context.clock.now(), &present)];
         let status = task.status.unwrap_or_default();
         let node = status.node.filter(|_| !status.phase.is_terminal());

@@ -259,9 +259,11 @@ pub(super) fn owner(key: &Key, uid: &FrameworkUid) -> serde_json::Value {
     })
 }
 
-/// The framework that owns an object.
+/// The framework that launched a task. Only the controller writes such a reference (`rest::launched`), so that it is to a
+/// framework of the task's namespace.
 pub(crate) fn owning(metadata: &ObjectMeta) -> Option<&OwnerReference> {
-    metadata.owner_references.iter().flatten().find(|o| o.kind == "Framework")
+    muster_controller_core::owner::controller(metadata)
+        .filter(|owner| owner.kind == "Framework" && owner.api_version == muster_api::API_VERSION)
 }
 
 /// Its uid.

@@ -7,6 +7,7 @@ use muster_api::kind::task::Task;
 use muster_api::selector::LabelSelector;
 
 use crate::cluster::NodeFacts;
+use crate::owner::Owner;
 use crate::taskset::view::{Claim, NodeView, TaskView};
 
 /// A task of the application.
@@ -56,8 +57,8 @@ pub const LINK_BANDWIDTH: &str = "muster.dev/link-bandwidth";
 impl TaskSeen {
     /// A task that the application controls; none: another does.
     #[must_use]
-    pub fn of(task: &Task, application_uid: &str) -> Option<Self> {
-        let view = TaskView::of(task, application_uid, &LabelSelector::default())?;
+    pub fn of(task: &Task, application: &Owner<'_>) -> Option<Self> {
+        let view = TaskView::of(task, application, &LabelSelector::default())?;
         let reserved = task.spec.resources.reserved();
         (view.claim == Claim::Mine).then(|| TaskSeen {
             uid: task.metadata.uid.clone().unwrap_or_default(),

@@ -336,7 +336,14 @@ impl World {
             task["spec"]["onDisconnect"] = json!({"policy": "Stop", "after": seconds(after)});
         }
         let task: Task = serde_json::from_value(task).expect("a Task");
-        TaskSeen::of(&task, "app-uid").expect("it is the application's")
+        let application = crate::owner::Owner {
+            api_version: "muster.dev/v1alpha1",
+            kind: "Application",
+            namespace: None,
+            name: "app",
+            uid: "app-uid",
+        };
+        TaskSeen::of(&task, &application).expect("it is the application's")
     }
 
     /// What must hold at any time.
