@@ -174,6 +174,10 @@ impl Session {
         self.say(report).await;
     }
 
+    pub(crate) async fn say_state(&self, state: wire::NodeState) {
+        self.say.send(wire::AgentMessage { body: Some(Say::Node(state)) }).await.unwrap();
+    }
+
     pub(crate) async fn say_pose(&self, pose: wire::Pose) {
         // An ended session takes nothing any more, which is what some tests look at.
         drop(self.say.send(wire::AgentMessage { body: Some(Say::Pose(pose)) }).await);
@@ -206,7 +210,8 @@ impl Session {
     }
 }
 
-fn robot() -> wire::NodeState {
+/// What it says of itself.
+pub(crate) fn robot() -> wire::NodeState {
     let compute =
         wire::Compute { cpu_millis: 1000, memory_bytes: 1 << 30, ..wire::Compute::default() };
     let runtime =

@@ -136,3 +136,41 @@ async fn a_session_ends_with_the_token_or_the_right_that_opened_it() {
     ends(session).await;
     cluster.running.shut_down().await.unwrap();
 }
+
+/// A reference, a finalizer and a label that a framework's own launches have.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_client_does_not_forge_what_a_framework_launched() {
+    let cluster = Cluster::start().await;
+    let admin = cluster.admin().await;
+    let forged = json!({
+        "finalizers": ["muster.dev/framework-acknowledges"],
+        "labels": {"muster.dev/framework": "deliver"},
+        "ownerReferences": [{
+            "apiVersion": "muster.dev/v1alpha1", "kind": "Framework", "name": "deliver", "uid": "u", "controller": true,
+        }],
+    });
+    let fields = |answer: &(u16, Value)| {
+        assert_eq!(refusal(answer), (422, "Invalid"));
+        let causes = answer.1["details"]["causes"].as_array().unwrap().iter();
+        causes.map(|cause| cause["field"].as_str().unwrap().to_owned()).collect::<Vec<_>>()
+    };
+    let places = [
+        "metadata.ownerReferences[0]",
+        "metadata.finalizers[0]",
+        "metadata.labels[\"muster.dev/framework\"]",
+    ];
+    let mut made = task("t");
+    for (field, value) in forged.as_object().unwrap() {
+        made["metadata"][field] = value.clone();
+    }
+    let (_, plan) = send(&admin, "POST", &format!("{G}/plan"), json!({"objects": []})).await;
+    let transaction = json!({"revision": plan["revision"], "requests": [{"create": made.clone()}]});
+    let whole = send(&admin, "POST", &format!("{G}/transaction"), transaction).await;
+    assert_ne!(whole.0, 200, "{whole:?}");
+    assert!(whole.1.to_string().contains("only the controller says"), "{whole:?}");
+    assert_eq!(fields(&send(&admin, "POST", TASKS, made).await), places);
+    assert_eq!(send(&admin, "POST", TASKS, task("t")).await.0, 201);
+    let patch = json!({"metadata": forged});
+    assert_eq!(fields(&send(&admin, "PATCH", &format!("{TASKS}/t"), patch).await), places);
+    cluster.running.shut_down().await.unwrap();
+}
