@@ -8,7 +8,7 @@
 //!
 //! [`Identity`] is put into the extensions of every request, where REST handlers and gRPC services find it. Access objects
 //! are read anew with every request, so that a right that was taken is gone with the next one; what lasts ends soon after
-//! ([`until_revoked`]).
+//! (`until_revoked`).
 
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;

@@ -13,7 +13,7 @@
 //! A line is written after a write was carried out and before it is answered: what was acknowledged has its line, also when
 //! the controller is killed the next moment. (A power loss may take the lines of the last moments, which the operating system
 //! had not written yet; the objects are synced, the lines are not.) While lines cannot be written, writes are refused with 503
-//! before they are carried out, but for those that only stop or take away ([`entry`] says which): nobody's robot goes on
+//! before they are carried out, but for those that only stop or take away (`entry` says which): nobody's robot goes on
 //! because a disk is full. What was carried out is never answered as if it were not: where its line is missing, a `Warning`
 //! says so, and the first line that can be written again says how many are missing, also after a restart.
 //!

@@ -254,7 +254,7 @@ pub enum Policy {
     Home,
 }
 
-/// The name of a part's task, which [`rules`] keep short enough. Numbers come again after a hundred thousand.
+/// The name of a part's task, which `rules` keep short enough. Numbers come again after a hundred thousand.
 #[must_use]
 pub fn task_name(application: &str, part: &str, number: u64) -> String {
     format!("{application}-{part}-{}", number % 100_000)
