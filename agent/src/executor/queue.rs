@@ -170,7 +170,8 @@ mod tests {
         assert_eq!((queue.pop().await, queue.pop().await), (0, 1));
         queue.room().await;
         queue.clear();
-        assert_eq!((queue.waiting().cost, queue.waiting().answers), (0, 0));
+        assert_eq!(queue.waiting().cost, 0);
+        assert_eq!(queue.waiting().answers, 0);
     }
 
     #[test]
