@@ -63,8 +63,15 @@ fn looks(function: &str) -> Value {
     json!({"resources": {"sensors": [function]}, "run": script("look", &[function]), "gracePeriodSeconds": 0})
 }
 
+/// Where the robot is; one that has just joined may not have said it yet.
 async fn pose(cluster: &Cluster) -> Value {
-    cluster.get("/apis/muster.dev/v1alpha1/nodes/robot/pose").await
+    let client = cluster.client().await;
+    wait::until("known where it is", async || {
+        let request = http::Request::get("/apis/muster.dev/v1alpha1/nodes/robot/pose");
+        let request = request.body(Vec::new()).expect("a request");
+        client.request::<Value>(request).await.map_err(|error| error.to_string())
+    })
+    .await
 }
 
 /// Waits until the robot is so far in the room; where it is.
