@@ -31,8 +31,8 @@ mod writer;
 
 use std::io;
 use std::path::PathBuf;
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
@@ -156,6 +156,8 @@ pub struct Audit {
     /// None: it ends.
     queue: Option<mpsc::Sender<Job>>,
     thread: Option<JoinHandle<()>>,
+    /// Instead of the thread.
+    here: Option<Mutex<Writer>>,
     shared: Arc<Shared>,
 }
 
@@ -176,7 +178,16 @@ impl Audit {
             // Its end of the queue is gone, so that no line can be written.
             tracing::error!(error = error as &dyn std::error::Error, "no thread for the audit log");
         }
-        Self { queue: Some(queue), thread: thread.ok(), shared }
+        Self { queue: Some(queue), thread: thread.ok(), here: None, shared }
+    }
+
+    /// A log whose lines are written by whoever has them, and no thread: where time goes on when everybody waits, nobody may wait
+    /// for what is not of that time.
+    #[must_use]
+    pub fn at_once(dir: PathBuf) -> Self {
+        let shared = Arc::<Shared>::default();
+        let writer = Writer::new(dir, (DONE, REFUSED), Arc::clone(&shared));
+        Self { queue: None, thread: None, here: Some(Mutex::new(writer)), shared }
     }
 
     /// Whether lines can be written.
@@ -227,6 +238,10 @@ impl Audit {
     }
 
     fn queue(&self, job: Job) -> io::Result<()> {
+        if let Some(writer) = &self.here {
+            writer.lock().unwrap_or_else(PoisonError::into_inner).take(job);
+            return Ok(());
+        }
         let queue = self.queue.as_ref().ok_or(io::ErrorKind::BrokenPipe)?;
         queue.try_send(job).map_err(|error| match error {
             mpsc::error::TrySendError::Full(_) => {

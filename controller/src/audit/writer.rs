@@ -44,6 +44,7 @@ struct Gap {
 }
 
 /// What the thread has.
+#[derive(Debug)]
 pub(super) struct Writer {
     dir: PathBuf,
     done: Log,
@@ -64,24 +65,29 @@ impl Writer {
     /// Until nobody can ask for anything any more.
     pub(super) fn run(mut self, mut jobs: mpsc::Receiver<Job>) {
         while let Some(job) = jobs.blocking_recv() {
-            self.missing.add(self.shared.lost.swap(0, Ordering::Relaxed));
-            let (full, answer, outcome) = match job {
-                Job::Open { now, answer } => (None, Some(answer), self.open(now)),
-                Job::Line { line, answer } => {
-                    let (full, written) = self.write(*line);
-                    (full, answer, written)
-                }
-            };
-            if let Some(answer) = answer {
-                // Who asked may have left.
-                drop(answer.send(outcome));
-            }
-            if let Some(full) = full {
-                self.sync(full);
-            }
+            self.take(job);
         }
         if let Some(syncing) = self.syncing.take() {
             drop(syncing.join());
+        }
+    }
+
+    /// Does what was asked.
+    pub(super) fn take(&mut self, job: Job) {
+        self.missing.add(self.shared.lost.swap(0, Ordering::Relaxed));
+        let (full, answer, outcome) = match job {
+            Job::Open { now, answer } => (None, Some(answer), self.open(now)),
+            Job::Line { line, answer } => {
+                let (full, written) = self.write(*line);
+                (full, answer, written)
+            }
+        };
+        if let Some(answer) = answer {
+            // Who asked may have left.
+            drop(answer.send(outcome));
+        }
+        if let Some(full) = full {
+            self.sync(full);
         }
     }
 
@@ -147,6 +153,7 @@ fn bytes_of<T: Serialize>(line: &T) -> io::Result<Vec<u8>> {
     Ok(bytes)
 }
 
+#[derive(Debug)]
 struct Log {
     dir: PathBuf,
     bound: Bound,
@@ -241,6 +248,7 @@ impl Open {
 }
 
 /// How many lines could not be written and are not told of yet, over the controller's lives.
+#[derive(Debug)]
 struct Missing {
     path: PathBuf,
     file: Option<File>,

@@ -23,6 +23,7 @@ use muster_api::phase::TaskPhase;
 use muster_api::wire::agent::v1 as wire;
 use muster_api::wire::framework::v1 as framework;
 use muster_controller::app;
+use muster_controller::audit::Audit;
 use muster_controller::auth::{Asker, Identity};
 use muster_controller::config::Config;
 use muster_controller::context::{Clock, Context};
@@ -331,7 +332,8 @@ async fn boot(house: &House, wall: Wall) -> Result<Port, String> {
     let (events, happenings) = Recorder::new();
     let metrics = PrometheusBuilder::new().build_recorder().handle();
     let address = SocketAddr::from(([127, 0, 0, 1], 7443));
-    let context = Context::new(store, pki, config(dir, address), address, metrics, events);
+    let mut context = Context::new(store, pki, config(dir, address), address, metrics, events);
+    context.audit = Audit::at_once(dir.join("audit"));
     let context = Arc::new(context.with_clock(Arc::new(wall)));
     rest::namespace::bootstrap(&context).await.map_err(|error| app::chain(&error))?;
     for member in members {
