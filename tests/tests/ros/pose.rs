@@ -127,14 +127,17 @@ async fn a_master_that_is_started_anew_is_found_again() {
     condition(&cluster, POSE_FRESH, ConditionStatus::False, "NoPublisher").await;
     ros.kill_core();
     let why = condition(&cluster, POSE_FRESH, ConditionStatus::False, "NoMaster").await;
-    assert!(why.contains("failed to connect"), "{why}");
+    // It refused the connection, or reset it in the middle of a question.
+    assert!(why.contains(&ros.master()), "{why}");
     ros.start_core().await;
     condition(&cluster, POSE_FRESH, ConditionStatus::False, "NoPublisher").await;
     let _driver = drive(&ros, &["odometry", "/odom", "30"], &[]);
     follows(&cluster, (0.0, 0.0, 0.0)).await;
     // Somebody ends the agent's node in ROS: it comes back.
-    drop(ros.output("rosnode", &["kill", "/muster_agent_rover_1"]).await);
-    condition(&cluster, POSE_FRESH, ConditionStatus::False, "NotRunning").await;
+    tokio::join!(
+        condition(&cluster, POSE_FRESH, ConditionStatus::False, "NotRunning"),
+        ros.output("rosnode", &["kill", "/muster_agent_rover_1"]),
+    );
     follows(&cluster, (0.0, 0.0, 0.0)).await;
 }
 
