@@ -24,7 +24,7 @@ use muster_controller_core::cluster::Cluster;
 use muster_controller_core::offer::allocator::Closest;
 use muster_controller_core::offer::book::Book;
 use muster_controller_core::offer::{OfferId, Wish};
-use muster_controller_core::schedule::{Demand, schedule};
+use muster_controller_core::schedule::{Demand, Plan, schedule};
 use muster_controller_core::space::{Slot, Space};
 use nalgebra::Point3;
 
@@ -220,33 +220,46 @@ fn cycle(robots: usize, frameworks: usize) {
     );
 }
 
+/// Moves a robot a little and places a task; the plan, and what both took.
+fn decide_after_move(
+    cluster: &mut Cluster,
+    (name, place): (&NodeName, &mut Point3<f64>),
+    (uid, placement): (&TaskUid, serde_json::Value),
+) -> (Plan, Duration) {
+    let spec = serde_json::json!({
+        "placement": placement,
+        "resources": {"cpu": "100m", "memory": "64Mi", "sensors": ["kinect:ImageGen"]},
+        "run": {"process": {"command": ["true"]}},
+    });
+    let spec: TaskSpec = serde_json::from_value(spec).expect("a spec");
+    let mut demand = [Demand {
+        uid: uid.clone(),
+        title: format!("default/{}", uid.as_str()).into(),
+        spec: Arc::new(spec),
+        since: 0,
+        avoid: Arc::default(),
+        framework: None,
+    }];
+    *place += nalgebra::Vector3::new(0.1, 0.0, 0.0);
+    let pose = pose(*place);
+    let start = Instant::now();
+    cluster.set_pose(name, &pose);
+    let plan = schedule(cluster, &mut demand);
+    (plan, start.elapsed())
+}
+
 fn decisions(robots: usize, tasks: usize) {
     let mut numbers = Numbers(3);
     let (mut cluster, names, mut places) = fleet(robots, &mut numbers);
     let mut spent = Duration::ZERO;
     for i in 0..tasks {
-        let spec = serde_json::json!({
-            "placement": {"at": {"x": numbers.below(side(robots)), "y": numbers.below(side(robots))}, "within": RADIUS},
-            "resources": {"cpu": "100m", "memory": "64Mi", "sensors": ["kinect:ImageGen"]},
-            "run": {"process": {"command": ["true"]}},
-        });
-        let spec: TaskSpec = serde_json::from_value(spec).expect("a spec");
+        let (x, y) = (numbers.below(side(robots)), numbers.below(side(robots)));
+        let placement = serde_json::json!({"at": {"x": x, "y": y}, "within": RADIUS});
         let uid = TaskUid::new(format!("task-{i}"));
-        let mut demand = [Demand {
-            uid: uid.clone(),
-            title: format!("default/task-{i}").into(),
-            spec: Arc::new(spec),
-            since: 0,
-            avoid: Arc::default(),
-            framework: None,
-        }];
         let moved = numbers.index(robots);
-        places[moved] += nalgebra::Vector3::new(0.1, 0.0, 0.0);
-        let pose = pose(places[moved]);
-        let start = Instant::now();
-        cluster.set_pose(&names[moved], &pose);
-        let plan = schedule(&mut cluster, &mut demand);
-        spent += start.elapsed();
+        let place = (&names[moved], &mut places[moved]);
+        let (plan, took) = decide_after_move(&mut cluster, place, (&uid, placement));
+        spent += took;
         black_box(&plan);
         // A fleet in use: half of the tasks stay.
         if i % 2 == 0 {
@@ -303,28 +316,13 @@ fn travel(robots: usize, positions: usize, tasks: usize) {
     println!("  wavefront over them: {:.0} ms", fronts.as_secs_f64() * 1e3 / positions as f64);
     let mut spent = Duration::ZERO;
     for i in 0..tasks {
-        let spec = serde_json::json!({
-            "placement": {"at": works[i % positions], "cost": "TravelTime", "on": "Robot"},
-            "resources": {"cpu": "100m", "memory": "64Mi", "sensors": ["kinect:ImageGen"]},
-            "run": {"process": {"command": ["true"]}},
-        });
-        let spec: TaskSpec = serde_json::from_value(spec).expect("a spec");
+        let at = &works[i % positions];
+        let placement = serde_json::json!({"at": at, "cost": "TravelTime", "on": "Robot"});
         let uid = TaskUid::new(format!("way-{i}"));
-        let mut demand = [Demand {
-            uid: uid.clone(),
-            title: format!("default/way-{i}").into(),
-            spec: Arc::new(spec),
-            since: 0,
-            avoid: Arc::default(),
-            framework: None,
-        }];
         let moved = numbers.index(robots);
-        places[moved] += nalgebra::Vector3::new(0.1, 0.0, 0.0);
-        let pose = pose(places[moved]);
-        let start = Instant::now();
-        cluster.set_pose(&names[moved], &pose);
-        let plan = schedule(&mut cluster, &mut demand);
-        spent += start.elapsed();
+        let place = (&names[moved], &mut places[moved]);
+        let (plan, took) = decide_after_move(&mut cluster, place, (&uid, placement));
+        spent += took;
         assert_eq!(plan.binds.len(), 1, "some robot can come");
         cluster.release(&uid);
     }

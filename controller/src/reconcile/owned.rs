@@ -1,6 +1,9 @@
 //! What an object controls: tasks and the like that are made with its name on them, in the transaction that writes its own
-//! status.
+//! status; and when it is looked at again.
 
+use std::time::Duration;
+
+use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::{ObjectMeta, OwnerReference};
 use muster_controller_core::owner;
 use serde::Deserialize;
@@ -11,6 +14,32 @@ use crate::quota::Pass;
 use crate::rest::create::{pass, prepare_object};
 use crate::rest::failure::Failure;
 use crate::store::{Key, Op, Precondition, Stored};
+
+/// When an object that controls others is looked at again.
+#[derive(Debug)]
+pub(super) enum Next {
+    /// When something changes.
+    Nothing,
+    /// Then, too.
+    At(Timestamp),
+    /// At once: what it relied on changed.
+    Again,
+}
+
+/// Until one is due; at once while one is to be looked at again.
+pub(super) async fn sleep_until(context: &Context, is_dirty: bool, when: Option<Timestamp>) {
+    if is_dirty {
+        // What made the last look fail arrives as an event; it should come first.
+        return tokio::task::yield_now().await;
+    }
+    match when {
+        Some(when) => {
+            let left = when.duration_since(context.clock.now());
+            tokio::time::sleep(Duration::try_from(left).unwrap_or_default()).await;
+        }
+        None => std::future::pending().await,
+    }
+}
 
 /// The part of an object that says whose it is.
 #[derive(Debug, Deserialize)]

@@ -22,7 +22,7 @@ use muster_api::kind::task::Task;
 use muster_controller_core::offload::run::view::TaskSeen;
 use muster_controller_core::offload::run::{Snapshot, plan};
 
-use super::owned::as_owner;
+use super::owned::{Next, as_owner, sleep_until};
 use super::{again, next_events, watch_from_now};
 use crate::context::Context;
 use crate::objects::{self, APPLICATIONS, TASKS};
@@ -59,7 +59,7 @@ async fn follow(context: &Context) -> Result<(), StoreError> {
             }
         }
         tokio::time::sleep(PAUSE).await;
-        let wait = sleep_until(context, &seen, later.values().min().copied());
+        let wait = sleep_until(context, seen.is_dirty(), later.values().min().copied());
         tokio::select! {
             // Cancel safe: events that were not returned are returned by the next call.
             events = next_events(&mut watcher) => {
@@ -73,30 +73,6 @@ async fn follow(context: &Context) -> Result<(), StoreError> {
             }
         }
     }
-}
-
-/// Until an application is due; at once while one is to be looked at again.
-async fn sleep_until(context: &Context, seen: &Seen, when: Option<Timestamp>) {
-    if seen.is_dirty() {
-        return;
-    }
-    match when {
-        Some(when) => {
-            let left = when.duration_since(context.clock.now());
-            tokio::time::sleep(Duration::try_from(left).unwrap_or_default()).await;
-        }
-        None => std::future::pending().await,
-    }
-}
-
-/// When an application is looked at again.
-enum Next {
-    /// When something changes.
-    Nothing,
-    /// Then, too.
-    At(Timestamp),
-    /// At once: what it relied on changed.
-    Again,
 }
 
 async fn look(context: &Context, seen: &Seen, key: &Key) -> Result<Next, StoreError> {

@@ -24,7 +24,7 @@ use muster_api::kind::taskset_revision::TaskSetRevision;
 use muster_controller_core::taskset::view::{RevisionView, TaskView};
 use muster_controller_core::taskset::{Snapshot, plan};
 
-use super::owned::as_owner;
+use super::owned::{Next, as_owner, sleep_until};
 use super::{again, next_events, watch_from_now};
 use crate::context::Context;
 use crate::objects::{self, NODES, QUOTAS, REVISIONS};
@@ -64,7 +64,7 @@ async fn follow(context: &Context) -> Result<(), StoreError> {
                 Next::Again => index.mark(key),
             }
         }
-        let wait = sleep_until(context, &index, later.values().min().copied());
+        let wait = sleep_until(context, index.is_dirty(), later.values().min().copied());
         tokio::select! {
             // Cancel safe: events that were not returned are returned by the next call.
             events = next_events(&mut watcher) => {
@@ -87,31 +87,6 @@ async fn follow(context: &Context) -> Result<(), StoreError> {
             }
         }
     }
-}
-
-/// Until a set is due; at once while one is to be looked at again.
-async fn sleep_until(context: &Context, index: &Index, when: Option<Timestamp>) {
-    if index.is_dirty() {
-        // What made the last look fail arrives as an event; it should come first.
-        return tokio::task::yield_now().await;
-    }
-    match when {
-        Some(when) => {
-            let left = when.duration_since(context.clock.now());
-            tokio::time::sleep(Duration::try_from(left).unwrap_or_default()).await;
-        }
-        None => std::future::pending().await,
-    }
-}
-
-/// When a set is looked at again.
-enum Next {
-    /// When something changes.
-    Nothing,
-    /// Then, too.
-    At(Timestamp),
-    /// At once: what it relied on changed.
-    Again,
 }
 
 async fn look(context: &Context, index: &Index, key: &Key) -> Result<Next, StoreError> {
