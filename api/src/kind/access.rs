@@ -43,6 +43,11 @@ pub struct AccessSpec {
     /// Where; absent: in the whole cluster, with what belongs to no namespace (nodes, leases, sites).
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub namespaces: Option<Vec<String>>,
+    /// Their tasks may reach past themselves into the nodes that they run on: processes, directories of a node, a node's
+    /// network. Who may do that is root there, if they want to be. Operators and administrators of the whole cluster may
+    /// without it.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub host_access: bool,
     /// Who.
     pub subjects: Vec<Subject>,
 }
@@ -147,6 +152,11 @@ fn rules(spec: &AccessSpec, violations: &mut Violations) {
             }
         }
     }
+    if spec.host_access && spec.role == Role::Viewer {
+        violations
+            .invalid("spec.hostAccess", "is of no use to a viewer, who runs nothing")
+            .suggest("leave it out, or give another role");
+    }
     let Some(namespaces) = &spec.namespaces else { return };
     if namespaces.is_empty() {
         violations
@@ -225,6 +235,19 @@ mod tests {
                 "spec.subjects[2].name: a name is not empty, and has no spaces around it",
                 "spec.namespaces[0]: \"*\" is not a name: lower-case letters, digits and '-' only, beginning and ending with a letter or digit; leave `namespaces` out for the whole cluster",
                 "spec.namespaces[1]: \"My_Lab\" is not a name: lower-case letters, digits and '-' only, beginning and ending with a letter or digit; try \"my-lab\"",
+            ]
+        );
+    }
+
+    #[test]
+    fn access_to_hosts_is_for_who_runs_something() {
+        let spec = |role| json!({"role": role, "hostAccess": true, "subjects": [{"name": "ada"}]});
+        assert_eq!(problems(spec("developer")), [""; 0]);
+        assert_eq!(problems(spec("framework")), [""; 0]);
+        assert_eq!(
+            problems(spec("viewer")),
+            [
+                "spec.hostAccess: is of no use to a viewer, who runs nothing; leave it out, or give another role"
             ]
         );
     }

@@ -17,8 +17,9 @@ use super::query::FieldValidation;
 use super::registry::Entry;
 use super::update::Options;
 use super::{
-    Answer, Call, admission, body, failure::Failure, launched, metadata, namespace, together,
+    Answer, Call, admission, body, failure::Failure, host, launched, metadata, namespace, together,
 };
+use crate::auth::Asker;
 use crate::context::Context;
 use crate::depends;
 use crate::objects::{self, TASKS};
@@ -36,13 +37,12 @@ pub(super) async fn create(call: Call, target: Object) -> Answer {
         return Err(Failure::method(call.request.method()));
     }
     let (dry, mode) = (call.query.dry_run()?, call.query.field_validation()?);
-    let Call { context, request, .. } = call;
+    let Call { context, asker, request, .. } = call;
     let (parts, body) = request.into_parts();
     let object = body::json(&parts.headers, body).await?;
     let namespace = target.namespace.as_deref();
-    let with = With::default();
-    let own = false;
-    let request = New { entry: target.entry, namespace, mode, dry, own, owners: None, with };
+    let (asker, with) = (Some(&asker), With::default());
+    let request = New { entry: target.entry, namespace, mode, dry, asker, owners: None, with };
     let (bytes, warnings) = store_new(&context, &request, object).await?;
     Ok(with_warnings(super::raw(StatusCode::CREATED, bytes), warnings))
 }
@@ -59,7 +59,7 @@ pub(super) async fn by_application(
         namespace: target.namespace.as_deref(),
         mode: options.mode,
         dry: options.dry,
-        own: false,
+        asker: Some(&options.asker),
         owners: object["metadata"].get("managedFields").cloned(),
         with: With::default(),
     };
@@ -88,7 +88,7 @@ fn ours(resource: Resource, namespace: Option<&str>) -> Result<New<'_>, Failure>
     let entry = super::registry::of(resource)
         .ok_or_else(|| Failure::internal(format!("{resource} is not served")))?;
     let mode = FieldValidation::Strict;
-    Ok(New { entry, namespace, mode, dry: false, own: true, owners: None, with: With::default() })
+    Ok(New { entry, namespace, mode, dry: false, asker: None, owners: None, with: With::default() })
 }
 
 /// A new object as a POST would store it, without storing it.
@@ -140,14 +140,15 @@ pub(crate) fn pass(
 
 /// A new object of a transaction.
 pub(super) fn prepare_with(
-    context: &Context,
+    (context, asker): (&Context, &Asker),
     entry: &'static Entry,
     namespace: Option<&str>,
     object: Value,
     with: With<'_>,
 ) -> Result<Value, Failure> {
     let mode = FieldValidation::Strict;
-    let new = New { entry, namespace, mode, dry: false, own: false, owners: None, with };
+    let asker = Some(asker);
+    let new = New { entry, namespace, mode, dry: false, asker, owners: None, with };
     prepare(context, &new, object).map(|prepared| prepared.object)
 }
 
@@ -246,8 +247,8 @@ struct New<'a> {
     namespace: Option<&'a str>,
     mode: FieldValidation,
     dry: bool,
-    /// The controller makes it, and no client.
-    own: bool,
+    /// Who makes it; none: the controller itself.
+    asker: Option<&'a Asker>,
     /// Whose its fields are, when somebody keeps account.
     owners: Option<Value>,
     with: With<'a>,
@@ -330,9 +331,10 @@ fn prepare(context: &Context, new: &New<'_>, mut object: Value) -> Result<Prepar
     }
     let name = metadata::text(&object, "name").unwrap_or_default().to_owned();
     let mut admitted = admission::admit(new.entry, &name, object, new.mode)?;
-    if !new.own {
+    if let Some(asker) = new.asker {
         launched::check(&Value::Null, &admitted.object)
             .into_result(())
+            .and_then(|()| host::check(asker, &Value::Null, &admitted.object).into_result(()))
             .map_err(|violations| Failure::invalid(new.entry, &name, &violations))?;
     }
     if new.entry.resource == TASKS {

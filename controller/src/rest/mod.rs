@@ -45,6 +45,7 @@ mod exec;
 pub mod failure;
 mod fence;
 mod form;
+pub(crate) mod host;
 #[cfg(test)]
 mod hostile;
 mod join;

@@ -217,8 +217,8 @@ impl<'a> Work<'a> {
         };
         let target = self.target(&named, Verb::Create)?;
         let (entry, namespace) = (target.entry, target.namespace.as_deref());
-        let with = With { objects: &self.created };
-        let object = create::prepare_with(self.context, entry, namespace, object.clone(), with)?;
+        let (by, with) = ((self.context, self.asker), With { objects: &self.created });
+        let object = create::prepare_with(by, entry, namespace, object.clone(), with)?;
         let made_here = namespace.is_some_and(|namespace| self.namespaces.contains(namespace));
         if let Some(namespace) = namespace.filter(|_| !made_here) {
             self.ops.extend(create::namespace_guard(self.context, entry.resource, namespace)?);

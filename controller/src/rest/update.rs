@@ -19,7 +19,8 @@ use super::owners::Writer;
 use super::path::{Object, Subresource};
 use super::query::FieldValidation;
 use super::registry::{Entry, View};
-use super::{Answer, Call, admission, body, failure::Failure, launched, metadata, owners};
+use super::{Answer, Call, admission, body, failure::Failure, host, launched, metadata, owners};
+use crate::auth::Asker;
 use crate::context::Context;
 use crate::store::{Op, Precondition, Store, StoreError, Stored};
 
@@ -28,6 +29,8 @@ pub(super) struct Options {
     pub(super) mode: FieldValidation,
     pub(super) dry: bool,
     /// Who makes it.
+    pub(super) asker: Asker,
+    /// Whose the fields are then.
     pub(super) writer: Writer,
     /// The change is an application: it says itself whose the fields are.
     pub(super) applies: bool,
@@ -51,7 +54,7 @@ impl Options {
         let (name, time) = (manager(call), call.context.stamp());
         let writer = Writer { name, subresource: "", view: None, time };
         let (mode, dry) = (call.query.field_validation()?, call.query.dry_run()?);
-        Ok(Self { mode, dry, writer, applies: false })
+        Ok(Self { mode, dry, asker: call.asker.clone(), writer, applies: false })
     }
 }
 
@@ -193,6 +196,7 @@ fn next(
         .map_err(|violations| Failure::invalid(entry, name, &violations))?;
     launched::check(&old, &admitted.object)
         .into_result(())
+        .and_then(|()| host::check(&options.asker, &old, &admitted.object).into_result(()))
         .map_err(|violations| Failure::invalid(entry, name, &violations))?;
     check_finalizers(entry, name, &old, &admitted.object)?;
     metadata::count(&old, &mut admitted.object);

@@ -137,6 +137,42 @@ async fn a_session_ends_with_the_token_or_the_right_that_opened_it() {
     cluster.running.shut_down().await.unwrap();
 }
 
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_framework_reaches_into_nodes_only_with_access_to_hosts() {
+    let cluster = Cluster::start().await;
+    let admin = cluster.admin().await;
+    let access = json!({
+        "apiVersion": "muster.dev/v1alpha1", "kind": "Access", "metadata": {"name": "courier"},
+        "spec": {"role": "framework", "namespaces": ["default"], "subjects": [{"name": "courier"}]},
+    });
+    assert_eq!(send(&admin, "POST", &format!("{G}/accesses"), access).await.0, 201);
+    let courier = cluster.user("courier").await;
+    let (_, event, mut session) = subscribe(&courier, "default").await;
+    let id = event["subscribed"]["sessionId"].as_str().unwrap();
+    let calls = format!("/framework/v1/session/{id}/calls");
+    let accept = |id: &str, run: Value| json!({"id": id, "accept": {"offers": ["0-3"], "launches": [{"spec": {"run": run}}]}});
+    let mut said = async |call: Value| {
+        assert_eq!(send(&courier, "POST", &calls, call.clone()).await.0, 202);
+        let answer = until(&mut session, |event| event["answer"]["id"] == call["id"]).await;
+        answer["answer"]["refusal"].clone()
+    };
+
+    let process = json!({"process": {"command": ["true"]}});
+    let refused = said(accept("1", process.clone())).await;
+    assert_eq!(refused["reason"], "REFUSAL_REASON_INVALID", "{refused}");
+    assert_eq!(refused["causes"][0]["field"], "launches[0].spec.run.process", "{refused}");
+    // The offer that is none comes after the spec that is wrong.
+    let gone = "REFUSAL_REASON_OFFER_GONE";
+    let container = json!({"container": {"image": "busybox", "network": "Bridge"}});
+    assert_eq!(said(accept("2", container)).await["reason"], gone);
+    // The session is older than the right.
+    let path = format!("{G}/accesses/courier");
+    let given = json!({"spec": {"hostAccess": true}});
+    assert_eq!(send(&admin, "PATCH", &path, given).await.0, 200);
+    assert_eq!(said(accept("3", process)).await["reason"], gone);
+    cluster.running.shut_down().await.unwrap();
+}
+
 /// A reference, a finalizer and a label that a framework's own launches have.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_client_does_not_forge_what_a_framework_launched() {

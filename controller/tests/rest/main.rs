@@ -9,6 +9,7 @@ mod dependencies;
 mod fencing;
 mod fleet;
 mod frameworks;
+mod host;
 mod leases;
 mod limits;
 mod objects;

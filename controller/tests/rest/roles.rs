@@ -411,6 +411,7 @@ async fn several_objects_at_once_are_decided_one_by_one() {
     let of = |namespace: &str| {
         let mut task = task("t");
         task["metadata"]["namespace"] = namespace.into();
+        task["spec"]["run"] = json!({"container": {"image": "busybox", "network": "None"}});
         task
     };
     let revision = cluster.running.context().store.revision().to_string();

@@ -15,7 +15,7 @@ const ROLES: &str = "
 apiVersion: muster.dev/v1alpha1
 kind: Access
 metadata: {name: students}
-spec: {role: developer, namespaces: [default], subjects: [{kind: Group, name: students}]}
+spec: {role: developer, namespaces: [default], hostAccess: true, subjects: [{kind: Group, name: students}]}
 ---
 apiVersion: muster.dev/v1alpha1
 kind: Access
@@ -25,7 +25,7 @@ spec: {role: viewer, subjects: [{kind: User, name: vera}]}
 apiVersion: muster.dev/v1alpha1
 kind: Access
 metadata: {name: couriers}
-spec: {role: framework, namespaces: [default], subjects: [{kind: User, name: courier}]}
+spec: {role: framework, namespaces: [default], hostAccess: true, subjects: [{kind: User, name: courier}]}
 ";
 
 /// The kubeconfig of a user, as `muster token create` prints it.

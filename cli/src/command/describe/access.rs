@@ -13,6 +13,9 @@ pub(super) fn describe(sheet: &mut Sheet, access: &Access, now: Timestamp) {
         Some(namespaces) => sheet.field("Namespaces", namespaces.join(", ")),
         None => sheet.field("Namespaces", "(the whole cluster)"),
     };
+    if access.spec.host_access {
+        sheet.field("Hosts", "their tasks may reach into the nodes that they run on");
+    }
     let subjects = access.spec.subjects.iter().map(|subject| match subject.kind {
         SubjectKind::User => format!("user {}", subject.name),
         SubjectKind::Group => format!("group {}", subject.name),

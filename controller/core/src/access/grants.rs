@@ -12,14 +12,17 @@ pub struct Grant {
     pub role: Role,
     /// None: in the whole cluster.
     pub namespace: Option<String>,
+    /// Whether tasks may reach into their nodes ([`super::host`]).
+    pub host_access: bool,
 }
 
 impl fmt::Display for Grant {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match &self.namespace {
-            Some(namespace) => write!(f, "{} in the namespace {namespace:?}", self.role),
-            None => write!(f, "{} of the whole cluster", self.role),
+            Some(namespace) => write!(f, "{} in the namespace {namespace:?}", self.role)?,
+            None => write!(f, "{} of the whole cluster", self.role)?,
         }
+        f.write_str(if self.host_access { " with access to hosts" } else { "" })
     }
 }
 
@@ -36,15 +39,11 @@ impl Grants {
     pub fn of<'a>(objects: impl IntoIterator<Item = &'a AccessSpec>) -> Self {
         let mut all = Self::default();
         for spec in objects {
+            let (role, host_access) = (spec.role, spec.host_access);
+            let of = |namespace: Option<String>| Grant { role, namespace, host_access };
             let given: Vec<Grant> = match &spec.namespaces {
-                None => vec![Grant { role: spec.role, namespace: None }],
-                Some(namespaces) => {
-                    let of = |namespace: &String| Grant {
-                        role: spec.role,
-                        namespace: Some(namespace.clone()),
-                    };
-                    namespaces.iter().map(of).collect()
-                }
+                None => vec![of(None)],
+                Some(namespaces) => namespaces.iter().cloned().map(Some).map(of).collect(),
             };
             for subject in &spec.subjects {
                 let whose = match subject.kind {

@@ -9,11 +9,13 @@
 //! |---|---|
 //! | `table` | roles × resources × verbs, and how far each right reaches: data |
 //! | [`grants`] | Access objects, by who they are for |
+//! | [`host`] | what of a task reaches into its node, and who may have it so |
 //!
 //! Rights add up: one grant that allows something is enough. What no row of the table names is for administrators of the
 //! whole cluster alone, so that something new is closed until somebody opens it.
 
 pub mod grants;
+pub mod host;
 mod table;
 
 use std::fmt;
@@ -226,7 +228,7 @@ fn needed(action: &Action<'_>) -> Grant {
     let role = order.into_iter().find(allows).unwrap_or(Role::Admin);
     let here = row.is_some_and(|row| row.reach(action.verb) == Reach::Namespace);
     let namespace = action.namespace.filter(|_| here).map(str::to_owned);
-    Grant { role, namespace }
+    Grant { role, namespace, host_access: false }
 }
 
 /// What somebody may do with a resource in a namespace.

@@ -5,7 +5,7 @@ use muster_api::kind::access::{AccessSpec, Subject, SubjectKind};
 use super::*;
 
 fn grant(role: Role, namespace: Option<&str>) -> Grant {
-    Grant { role, namespace: namespace.map(str::to_owned) }
+    Grant { role, namespace: namespace.map(str::to_owned), host_access: false }
 }
 
 fn action<'a>(verb: Verb, what: &'a str, namespace: Option<&'a str>) -> Action<'a> {
@@ -126,6 +126,7 @@ fn a_refusal_says_what_the_user_is_and_which_role_may() {
 fn rights_add_up_by_name_and_by_group() {
     let subject = |kind, name: &str| Subject { kind, name: name.to_owned() };
     let spec = |role, namespaces: Option<&[&str]>, subject| AccessSpec {
+        host_access: false,
         role,
         namespaces: namespaces.map(|all| all.iter().map(|&name| name.to_owned()).collect()),
         subjects: vec![subject],

@@ -20,7 +20,7 @@ use serde_json::{Value, json};
 use super::failure::Failure;
 use super::path::{Object, Subresource};
 use super::query::Query;
-use super::{Answer, Call, log};
+use super::{Answer, Call, host, log};
 use crate::auth::Identity;
 use crate::objects;
 use crate::session::execs::{Asked, ExecError, Ready};
@@ -41,6 +41,10 @@ pub(super) async fn open(call: Call, target: Object) -> Answer {
     let stored = stored.ok_or_else(|| Failure::not_found(target.entry, &key.name))?;
     let task: Task = objects::read(&stored)
         .ok_or_else(|| Failure::internal(format!("task {} cannot be read", key.name)))?;
+    // What a task writes is as much as its log, which may be read.
+    if !asked.command.is_empty() {
+        host::check_entry(&call.asker, &task)?;
+    }
     let Some(live) = call.context.live() else {
         return Err(Failure::unavailable("no agent session service is running"));
     };

@@ -12,12 +12,14 @@ use muster_controller_core::offer::OfferId;
 use serde_json::{Value, json};
 
 use super::{convert, subscribe};
+use crate::auth::Asker;
 use crate::context::Context;
 use crate::objects::TASKS;
 use crate::quota::Pass;
 use crate::reconcile::desk::{FrameworkUid, Prepared};
 use crate::rest::create;
 use crate::rest::failure::Failure;
+use crate::rest::host;
 use crate::store::{Key, Op};
 use crate::{configs, depends};
 
@@ -47,7 +49,7 @@ type Wrong = (Fault, Vec<wire::Cause>);
 
 /// Checks everything that can be checked without the ledger; all that is wrong is said at once.
 pub(super) fn prepare(
-    context: &Context,
+    (context, asker): (&Context, &Asker),
     (framework, uid): (&Key, &FrameworkUid),
     accept: &wire::Accept,
 ) -> Result<(Vec<Prepared>, Option<Op>), wire::Refusal> {
@@ -75,7 +77,7 @@ pub(super) fn prepare(
             });
             continue;
         };
-        match task_of(context, (framework, uid), launch) {
+        match task_of((context, asker), (framework, uid), launch) {
             Ok((object, task, pass)) => prepared.push(Prepared {
                 key: Key::namespaced(
                     TASKS,
@@ -109,7 +111,7 @@ pub(super) fn parse(id: &str) -> Option<OfferId> {
 }
 
 fn task_of(
-    context: &Context,
+    (context, asker): (&Context, &Asker),
     (framework, uid): (&Key, &FrameworkUid),
     launch: &wire::Launch,
 ) -> Result<(Value, Task, Option<Pass>), Wrong> {
@@ -137,6 +139,10 @@ fn task_of(
     };
     let object = create::prepare_object(context, TASKS, object)
         .map_err(|failure| (Fault::Invalid, causes_of(&failure)))?;
+    let reaches = host::check(asker, &Value::Null, &object);
+    if !reaches.is_empty() {
+        return Err((Fault::Invalid, convert::causes("", &reaches)));
+    }
     let task: Task =
         serde_json::from_value(object.clone()).map_err(|error| wrong("spec", error.to_string()))?;
     let namespace = framework.namespace().unwrap_or_default();

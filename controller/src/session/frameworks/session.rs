@@ -399,7 +399,10 @@ impl Session {
             return self.answer(id, Some(convert::offers_gone(unread))).await;
         }
         let owner = (&self.guest.key, &self.guest.uid);
-        let prepared = launch::prepare(&self.frameworks.context, owner, accept);
+        let context = &self.frameworks.context;
+        // What they may at this moment: the session lasts longer.
+        let asker = Asker::with(context, (*self.by).clone());
+        let prepared = launch::prepare((context, &asker), owner, accept);
         let (launches, guard) = match prepared {
             Ok(prepared) => prepared,
             Err(refusal) => return self.answer(id, Some(refusal)).await,
