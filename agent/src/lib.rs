@@ -64,6 +64,7 @@ mod runtime;
 mod sensor;
 pub mod shim;
 pub mod sim;
+mod socket;
 mod spec;
 mod supervisor;
 mod told;

@@ -230,6 +230,7 @@ fn program(assignment: &Assignment) -> (Program, BTreeMap<String, String>) {
                 task::Network::None => Network::None,
                 task::Network::Bridge => Network::Bridge,
             },
+            run_as: run.user.clone(),
             user: None,
             pull: run.pull_policy.into(),
         });

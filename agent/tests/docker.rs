@@ -91,6 +91,39 @@ fn container(uid: &str) -> String {
     })
 }
 
+/// A set of capabilities of the first process, by numbers (capabilities(7)).
+fn capabilities(status: &str, set: &str) -> Vec<u32> {
+    let line = status.lines().find_map(|line| line.strip_prefix(set)).expect(set);
+    let bits = u64::from_str_radix(line.trim(), 16).unwrap();
+    (0..64).filter(|bit| bits >> bit & 1 == 1).collect()
+}
+
+#[test]
+fn a_container_has_few_privileges_and_gains_none() {
+    let _cleanup = Cleanup(vec!["d-root", "d-user"]);
+    let controller = Controller::start();
+    let agent = start(&controller);
+    let status = |uid: &'static str, spec: Value| {
+        controller.assign(uid, spec);
+        let end = controller.wait_end(uid);
+        assert_eq!(end.exit_code, Some(0), "{end:?}");
+        let ask = proto::LogRequest { id: 1, uid: uid.to_owned(), ..Default::default() };
+        controller.logs(ask).0
+    };
+    let root = status("d-root", sh("cat /proc/self/status"));
+    assert!(root.contains("NoNewPrivs:\t1\n") && root.contains("Seccomp:\t2\n"), "{root}");
+    // CHOWN, DAC_OVERRIDE, FOWNER, FSETID, KILL, SETGID, SETUID, NET_BIND_SERVICE.
+    assert_eq!(capabilities(&root, "CapBnd:"), [0, 1, 3, 4, 5, 6, 7, 10], "{root}");
+
+    let mut spec = sh("id -u; echo hello > $MUSTER_RUN_DIR/there; cat /proc/self/status");
+    spec["run"]["container"]["user"] = json!("4711:4712");
+    let user = status("d-user", spec);
+    assert!(user.starts_with("4711\n") && user.contains("Gid:\t4712\t"), "{user}");
+    assert!(capabilities(&user, "CapEff:").is_empty(), "{user}");
+    let there = std::fs::read_to_string(agent.task_dir("d-user").join("run/there")).unwrap();
+    assert_eq!(there, "hello\n");
+}
+
 #[test]
 fn a_container_runs_and_its_exit_code_is_reported() {
     let _cleanup = Cleanup(vec!["d-ok", "d-bad", "d-none"]);
@@ -124,7 +157,7 @@ fn a_container_runs_and_its_exit_code_is_reported() {
 
 #[test]
 fn limits_are_the_kernels() {
-    let _cleanup = Cleanup(vec!["d-spin", "d-fat"]);
+    let _cleanup = Cleanup(vec!["d-spin", "d-fat-1", "d-fat-2", "d-fat-3"]);
     let controller = Controller::start();
     let _agent = start(&controller);
     let mut spec = sh("while :; do :; done");
@@ -154,9 +187,14 @@ fn limits_are_the_kernels() {
     controller.wait_end("d-spin");
     let mut spec = sh("exec dd if=/dev/zero of=/dev/null bs=200M count=1");
     spec["resources"] = json!({ "memory": "64Mi" });
-    controller.assign("d-fat", spec);
-    let end = controller.wait_end("d-fat");
-    assert_eq!((end.reason.as_str(), end.exit_code), ("OOMKilled", Some(137)), "{end:?}");
+    // The engine tells of an end and of its cause apart, and may be late with the cause.
+    let told = ["d-fat-1", "d-fat-2", "d-fat-3"].into_iter().any(|uid| {
+        controller.assign(uid, spec.clone());
+        let end = controller.wait_end(uid);
+        assert_eq!(end.exit_code, Some(137), "{end:?}");
+        end.reason == "OOMKilled"
+    });
+    assert!(told, "of none it is said that it was killed for its memory");
 }
 
 #[test]
@@ -208,7 +246,7 @@ fn a_container_that_may_not_run_alone_ends_alone() {
     let controller = Controller::start();
     let mut agent = start(&controller);
     let mut spec = sh("while :; do sleep 1; done");
-    spec["onDisconnect"] = json!({ "policy": "Stop", "after": "1s" });
+    spec["onDisconnect"] = json!({ "policy": "Stop", "after": "5s" });
     spec["gracePeriodSeconds"] = json!(0);
     controller.assign("d-tied", spec);
     controller.wait_running("d-tied");
@@ -278,10 +316,21 @@ fn served(network: &str, port: u16) -> Value {
         "run": { "container": { "image": image(), "network": network,
             "command": ["/bin/busybox", "httpd", "-f", "-p", port.to_string(), "-h", "/run/muster"] } },
         "readiness": { "http": { "path": "/ready", "port": port }, "period": "100ms",
-            "timeout": "20s", "failureThreshold": 1 },
+            "timeout": "20s", "initialDelay": "2s", "failureThreshold": 1 },
         "liveness": { "tcp": { "port": port }, "period": "100ms", "timeout": "20s",
             "initialDelay": "2s", "failureThreshold": 1000 },
     })
+}
+
+/// A free port of the machine, below those that the kernel gives away by itself: it stays free until it is used.
+fn free_port() -> u16 {
+    let given = std::fs::read_to_string("/proc/sys/net/ipv4/ip_local_port_range").unwrap();
+    let least: u16 = given.split_whitespace().next().unwrap().parse().unwrap();
+    let ports = 20_000..least.max(21_000);
+    // Others that look at the same time begin elsewhere.
+    let first = std::process::id() as usize % ports.len();
+    let mut turn = ports.clone().cycle().skip(first).take(ports.len());
+    turn.find(|port| std::net::TcpListener::bind(("0.0.0.0", *port)).is_ok()).unwrap()
 }
 
 #[test]
@@ -289,7 +338,7 @@ fn probes_reach_a_container_in_each_network() {
     let _cleanup = Cleanup(vec!["d-net-none", "d-net-bridge", "d-net-host"]);
     let controller = Controller::start();
     let agent = start(&controller);
-    let free = std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
+    let free = free_port();
     // The same port in two networks of their own: each is asked in its own.
     for (uid, network, port) in
         [("d-net-none", "None", 80), ("d-net-bridge", "Bridge", 80), ("d-net-host", "Host", free)]
@@ -334,11 +383,11 @@ fn a_check_runs_inside_its_container_and_is_killed_when_it_takes_too_long() {
 
     let mut spec = sh("exec sleep 1000");
     spec["readiness"] = exec(json!(["/bin/sleep", "1234"]));
-    spec["readiness"]["timeout"] = json!("1s");
+    spec["readiness"]["timeout"] = json!("5s");
     spec["readiness"]["period"] = json!("1h");
     controller.assign("d-late", spec);
     let id = container("d-late");
-    controller.wait("d-late", "timeout", |r| r.message.contains("no answer within 1s"));
+    controller.wait("d-late", "timeout", |r| r.message.contains("no answer within 5s"));
     until("the end of the check", || (!docker(&["top", &id]).contains("1234")).then_some(()));
     controller.stop("d-late", 0);
     controller.wait_end("d-late");

@@ -208,7 +208,7 @@ fn an_executor_that_is_asked_and_stays_is_signalled() {
     assign_watching(&controller, &dir.path().join("never"));
     let mut executor = Executor::register(&agent, "exec", &[]);
     controller.wait_running("exec");
-    controller.stop("exec", 6_000);
+    controller.stop("exec", 20_000);
     assert!(matches!(executor.hear(), Heard::Shutdown(_)));
     let end = controller.wait_end("exec");
     assert_eq!((end.exit_code, end.reason.as_str()), (Some(3), "Stopped"), "{end:?}");
@@ -288,7 +288,7 @@ fn a_work_of_which_nothing_was_said_ends_without_contact_too() {
     let mut executor = Executor::register(&agent, "exec", &[]);
     let spec = json!({
         "run": { "executor": { "task": "exec", "data": {} } },
-        "onDisconnect": { "policy": "Stop", "after": "1s" },
+        "onDisconnect": { "policy": "Stop", "after": "5s" },
     });
     assign(&controller, "tied", &spec);
     assert_eq!(executor.launched().task, "tied");

@@ -6,6 +6,7 @@
 mod common;
 
 use std::process::{Command, Stdio};
+use std::time::{Duration, Instant};
 
 use common::agent::Agent;
 use common::controller::Controller;
@@ -151,12 +152,13 @@ fn a_stop_does_not_wait_for_an_agent_that_cannot_speak() {
         ..Default::default()
     });
     // What it would say next waits for room that there is not: a session that takes orders in turn would not take this.
-    let (mut before, mut looks) = (0, 0);
+    let (mut before, mut since) = (0, Instant::now());
     until("it to be stuck", || {
         let now = agent.bytes_read();
-        looks = if now == before { looks + 1 } else { 0 };
-        before = now;
-        (looks >= 60).then_some(())
+        if now != before {
+            (before, since) = (now, Instant::now());
+        }
+        (since.elapsed() >= Duration::from_millis(250)).then_some(())
     });
     controller.order_estop(1, 0);
     driver.wait("stop");
@@ -174,6 +176,7 @@ fn the_robot_stands_without_its_agent_and_goes_on_with_the_next() {
     let (gate, pid) = (agent.gate_pid(), agent.main_pid("a", 1));
     let mut a = Holder::register(&agent, "a");
     assert_eq!(a.verdict("6", "go 1"), Verdict::Ok);
+    driver.wait("go 1");
     agent.kill();
     driver.wait("stop");
     assert_eq!(a.verdict("6", "go wrong"), Verdict::Unknown);
@@ -221,6 +224,7 @@ fn another_holder_has_the_robot_when_the_first_is_gone() {
     let agent = robot(&controller, &driver);
     let mut a = Holder::register(&agent, "a");
     assert_eq!(a.verdict("6", "go 1"), Verdict::Ok);
+    driver.wait("go 1");
     controller.stop("a", 0);
     controller.wait_end("a");
     driver.wait("stop");
@@ -262,7 +266,15 @@ fn a_button_stops_the_robot_until_a_person_releases_it() {
     controller.order_estop(0, told.number);
     until("the release", || (a.verdict("6", "go 2") == Verdict::Ok).then_some(()));
     controller.order_estop(2, told.number);
-    driver.wait("stop");
+    // Without power it may not live to write down its stop.
+    until("its power is cut", || {
+        let state = controller.state()?;
+        let cut = |c: &agent_proto::Condition| {
+            c.r#type == "ActuatorsFenced" && !c.status && c.message.contains("its power is cut")
+        };
+        state.conditions.iter().any(cut).then_some(())
+    });
+    assert_eq!(a.verdict("6", "go wrong"), Verdict::Stopped);
     assert!(!driver.heard().contains(&"go wrong".to_owned()), "{:?}", driver.heard());
 }
 

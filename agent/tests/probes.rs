@@ -5,7 +5,7 @@
 mod common;
 
 use std::io::{Read, Write};
-use std::net::TcpListener;
+use std::net::{TcpListener, TcpStream};
 use std::path::Path;
 use std::sync::atomic::{AtomicU16, Ordering};
 use std::sync::{Arc, Mutex};
@@ -18,9 +18,9 @@ use rustls::pki_types::PrivateKeyDer;
 use rustls::pki_types::pem::PemObject;
 use serde_json::{Value, json};
 
-/// A task that lives until it is told to end, and ends well then.
+/// A task that lives until it is told to end, and ends well then; `obeys` in its run directory says that it would by now.
 fn obedient() -> Value {
-    sh("trap 'exit 0' TERM; while :; do sleep 0.05; done")
+    sh("trap 'exit 0' TERM; : > $MUSTER_RUN_DIR/obeys; while :; do sleep 0.05; done")
 }
 
 fn sh(script: &str) -> Value {
@@ -159,8 +159,12 @@ fn a_check_is_where_its_task_is() {
     spec["readiness"] = exec(&format!("{WHO} > $MUSTER_RUN_DIR/check"));
     controller.assign("where", spec);
     wait_ready(&controller, "where", true);
-    let read =
-        |name| std::fs::read_to_string(agent.task_dir("where").join("run").join(name)).unwrap();
+    let run = agent.task_dir("where").join("run");
+    // One that is being written is read again.
+    let read = |name: &str| {
+        let text = || std::fs::read_to_string(run.join(name)).ok();
+        until(name, || text().filter(|text| text.ends_with('\n')))
+    };
     let told = read("task");
     assert!(told.starts_with("65534:65534 /tmp b c where "), "{told}");
     assert_eq!(read("check"), told);
@@ -190,9 +194,13 @@ fn http_and_tcp_are_asked() {
         server.say(status);
         wait_ready(&controller, "web", ready);
     }
-    // A port of which nobody hears.
-    let port = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
+    // A port of which nobody hears, and at which nobody can begin to: a connection's own end is there.
+    let any = TcpListener::bind("127.0.0.1:0").unwrap();
+    let held = TcpStream::connect(any.local_addr().unwrap()).unwrap();
+    let port = held.local_addr().unwrap().port();
     let mut spec = obedient();
+    spec["startup"] = exec("[ -e $MUSTER_RUN_DIR/obeys ]");
+    spec["startup"]["failureThreshold"] = json!(10_000);
     spec["liveness"] = json!({ "tcp": { "port": port, "host": "localhost" }, "period": "100ms", "failureThreshold": 2 });
     controller.assign("deaf", spec);
     let end = controller.wait_end("deaf");
@@ -286,13 +294,13 @@ fn a_check_that_takes_too_long_is_killed_whole_and_none_pile_up() {
     let mut spec = obedient();
     // The second process is in the check's group, and would be left.
     spec["readiness"] = exec("sleep 1000 & echo $! > $MUSTER_RUN_DIR/child; echo loading; wait");
-    spec["readiness"]["timeout"] = json!("300ms");
+    spec["readiness"]["timeout"] = json!("5s");
     spec["readiness"]["period"] = json!("1h");
     // Each takes longer than the period.
     spec["liveness"] =
         exec("cd $MUSTER_RUN_DIR; mkdir one || touch two; sleep 0.3; rmdir one; echo >> count");
     controller.assign("late", spec);
-    let late = wait_said(&controller, "late", "no answer within 300ms: loading");
+    let late = wait_said(&controller, "late", "no answer within 5s: loading");
     assert_eq!(late.ready, Some(false));
     let run = agent.task_dir("late").join("run");
     let child = pid_in(&run.join("child"));
@@ -365,9 +373,9 @@ fn the_agent_is_killed_and_its_probes_go_on_without_a_flap() {
 fn an_attempt_that_failed_its_probe_is_ended_by_the_next_life_of_the_agent() {
     let controller = Controller::start();
     let mut agent = Agent::start(&controller);
-    let mut spec = sh("trap '' TERM; while :; do sleep 0.05; done");
+    let mut spec = sh("trap '' TERM; : > $MUSTER_RUN_DIR/deaf; while :; do sleep 0.05; done");
     spec["gracePeriodSeconds"] = json!(600);
-    spec["liveness"] = exec("echo hung; exit 1");
+    spec["liveness"] = exec("[ ! -e $MUSTER_RUN_DIR/deaf ] || { echo hung; exit 1; }");
     controller.assign("stuck", spec);
     let stops = controller.wait("stuck", "stop", |r| r.reason == "LivenessFailed");
     assert_eq!(stops.phase(), proto::TaskPhase::Stopping);

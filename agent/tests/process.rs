@@ -72,7 +72,7 @@ fn environment_directory_and_user() {
     let controller = Controller::start();
     let agent = Agent::start(&controller);
     let script = "echo $MUSTER_TASK $MUSTER_NAMESPACE $MUSTER_UID $MUSTER_NODE $MUSTER_ATTEMPT $MUSTER_LEASE; \
-        echo $A '$A'; id -u; pwd; touch here $MUSTER_RUN_DIR/there && echo wrote; echo oops >&2";
+        echo $A '$A'; id -u; grep NoNewPrivs /proc/self/status; pwd; touch here $MUSTER_RUN_DIR/there && echo wrote; echo oops >&2";
     let mut spec = sh(script);
     spec["run"]["process"]["env"] = json!([{ "name": "A", "value": "b $c" }]);
     spec["run"]["process"]["user"] = json!("nobody");
@@ -96,7 +96,7 @@ fn environment_directory_and_user() {
     assert_eq!(error, "");
     let work = agent.task_dir("env").join("work");
     let expected = format!(
-        "drive lab env robot-1 1 robot-1.body:3\nb $c $A\n65534\n{}\nwrote\n",
+        "drive lab env robot-1 1 robot-1.body:3\nb $c $A\n65534\nNoNewPrivs:\t1\n{}\nwrote\n",
         work.display()
     );
     // Two streams have no order between them.
@@ -190,9 +190,12 @@ fn what_a_program_leaves_behind_ends_with_it() {
 #[test]
 fn a_polite_program_ends_within_its_grace() {
     let controller = Controller::start();
-    let _agent = Agent::start(&controller);
-    controller.assign("polite", sh("trap 'exit 0' TERM; while :; do sleep 0.05; done"));
+    let agent = Agent::start(&controller);
+    let script = "trap 'exit 0' TERM; : > $MUSTER_RUN_DIR/ready; while :; do sleep 0.05; done";
+    controller.assign("polite", sh(script));
     controller.wait_running("polite");
+    let ready = agent.task_dir("polite").join("run/ready");
+    until("its trap", || ready.exists().then_some(()));
     controller.stop("polite", 30_000);
     let end = controller.wait_end("polite");
     assert_eq!((end.phase(), end.exit_code), (proto::TaskPhase::Succeeded, Some(0)), "{end:?}");
@@ -267,20 +270,31 @@ fn a_shim_killed_while_the_agent_was_away() {
 fn restarts_back_off_and_are_counted() {
     let controller = Controller::start();
     let agent = Agent::start(&controller);
-    let mut spec = sh("echo run $MUSTER_ATTEMPT; exit 4");
+    // The third attempt stays, so there is time to ask for what was said.
+    let script = "echo run $MUSTER_ATTEMPT; [ $MUSTER_ATTEMPT -lt 3 ] || exec sleep 1000; exit 4";
+    let mut spec = sh(script);
     spec["restartPolicy"] = json!("OnFailure");
     controller.assign("again", spec);
-    let third = controller
-        .wait("again", "third attempt", |report| report.attempt == 3 && report.reason == "BackOff");
-    assert_eq!((third.restarts, third.exit_code), (3, Some(4)), "{third:?}");
+    let second = controller
+        .wait("again", "second end", |report| report.attempt == 2 && report.reason == "BackOff");
+    assert_eq!((second.restarts, second.exit_code), (2, Some(4)), "{second:?}");
+    let third = controller.wait("again", "third attempt", |report| {
+        report.attempt == 3 && report.phase() == proto::TaskPhase::Running
+    });
+    assert_eq!(third.restarts, 2, "{third:?}");
     let ask = |id, previous| proto::LogRequest {
         id,
         uid: "again".to_owned(),
         previous,
         ..Default::default()
     };
-    assert_eq!(controller.logs(ask(1, false)).0, "run 3\n");
-    assert_eq!(controller.logs(ask(2, true)).0, "run 2\n");
+    let mut ids = 1..;
+    for (previous, said) in [(false, "run 3\n"), (true, "run 2\n")] {
+        until(said, || {
+            let id = ids.next()?;
+            (controller.logs(ask(id, previous)).0 == said).then_some(())
+        });
+    }
     controller.stop("again", 0);
     controller.wait_end("again");
     assert!(agent.has_exit_record("again", 3));

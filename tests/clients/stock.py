@@ -105,10 +105,12 @@ def watch_goes_on():
     v1 = client.CoreV1Api()
     body = {"metadata": {"name": "counted"}, "data": {"n": "0"}}
     first = v1.create_namespaced_config_map("default", body)
-    done = threading.Event()
+    ended, done = threading.Event(), threading.Event()
 
     def write():
         for n in range(1, 41):
+            if n == 40:
+                ended.wait(DEADLINE)  # There is something left for another watch.
             v1.patch_namespaced_config_map("counted", "default", {"data": {"n": str(n)}})
             time.sleep(0.05)
         done.set()
@@ -126,6 +128,7 @@ def watch_goes_on():
             if len(numbers) == 40:
                 break
         ends += 1
+        ended.set()
     assert numbers == list(range(1, 41)), numbers
     assert done.wait(DEADLINE) and ends > 1, ends
 

@@ -274,9 +274,18 @@ impl Cluster {
 
     /// POST as the admin; the answer's JSON.
     pub async fn post(&self, path: &str, body: &Value) -> Value {
-        let request = Request::post(path).header("content-type", "application/json");
-        let request = request.body(serde_json::to_vec(body).expect("JSON")).expect("a request");
-        self.client().await.request(request).await.expect("the controller takes it")
+        let (client, body) = (self.client().await, serde_json::to_vec(body).expect("JSON"));
+        let told = wait::until("an answer to a write", || async {
+            let request = Request::post(path).header("content-type", "application/json");
+            let request = request.body(body.clone()).expect("a request");
+            match client.request::<Value>(request).await {
+                // Nothing was written: a busy disk. Every client tries that again.
+                Err(kube::Error::Api(status)) if status.code == 503 => Err(status.message),
+                told => Ok(told),
+            }
+        })
+        .await;
+        told.expect("the controller takes it")
     }
 
     /// GET as the admin; the answer's JSON.
@@ -320,9 +329,18 @@ impl Cluster {
 
     /// The log of a task of the default namespace.
     pub async fn task_log(&self, task: &str) -> String {
+        self.try_task_log(task).await.expect("a log")
+    }
+
+    /// The same inside a wait. A node that is not heard for a moment refuses it.
+    ///
+    /// # Errors
+    ///
+    /// What the controller says when there is none now.
+    pub async fn try_task_log(&self, task: &str) -> Result<String, String> {
         let request = Request::get(format!("{API}/namespaces/default/tasks/{task}/log"));
         let request = request.body(Vec::new()).expect("a request");
-        self.client().await.request_text(request).await.expect("a log")
+        self.client().await.request_text(request).await.map_err(|error| error.to_string())
     }
 
     /// Joins an agent; returns when its node is ready.
@@ -361,10 +379,17 @@ impl Cluster {
         child.wait().expect("it is ours");
     }
 
-    /// Starts a killed agent again, without a token.
+    /// Starts a killed agent again, without a token; returns when its node is ready by its word.
     pub async fn restart_agent(&mut self, name: &str) {
+        let node = self.nodes().await.get(name).await.expect("it has joined");
+        let before = node.status.and_then(|status| status.incarnation);
         self.spawn_agent(name, None);
-        self.node_ready(name).await;
+        // Of the one that was killed the node may still be called ready.
+        let back = |n: Option<&Node>| {
+            n.and_then(|n| n.status.as_ref())
+                .is_some_and(|s| s.is_ready() && s.incarnation != before)
+        };
+        wait::object(self.nodes().await, name, "ready again", back).await;
     }
 
     /// Changes a flag of an agent's command line, for its next start.

@@ -46,7 +46,14 @@ impl Ros {
 
     /// Starts the killed roscore again, on the same port.
     pub async fn start_core(&self) {
-        assert!(self.try_start_core().await, "no roscore; its log: {}", self.log());
+        // A process that was killed may hold the port for a moment.
+        for _ in 0..3 {
+            if self.try_start_core().await {
+                return;
+            }
+            self.kill_core();
+        }
+        panic!("no roscore; its log: {}", self.log());
     }
 
     async fn try_start_core(&self) -> bool {

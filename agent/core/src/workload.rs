@@ -441,6 +441,8 @@ impl Workload {
             }
         } else {
             self.say(Reason::AwaitingContact, "waits for contact with the controller".to_owned());
+            // It may be back, by a word that was on its way, without anybody saying so.
+            effects.push(Effect::WakeAt(context.now.boot.plus(RETRY_MS.0)));
         }
     }
 

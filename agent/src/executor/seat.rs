@@ -5,7 +5,7 @@
 
 use std::fs;
 use std::io;
-use std::os::unix::fs::{DirBuilderExt, PermissionsExt};
+use std::os::unix::fs::DirBuilderExt;
 use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
@@ -21,6 +21,7 @@ use tokio_util::task::AbortOnDropHandle;
 
 use super::desk::Desks;
 use super::frame;
+use crate::socket;
 
 /// Who connects shows the token within this.
 const SHOW_WITHIN: Duration = Duration::from_secs(10);
@@ -45,10 +46,8 @@ impl Seat {
         // Not the task's: whoever could write here could have the agent change the mode of a file.
         unless(io::ErrorKind::AlreadyExists, fs::DirBuilder::new().mode(0o711).create(dir))?;
         let path = dir.join(super::SOCKET);
-        unless(io::ErrorKind::NotFound, fs::remove_file(&path))?;
-        let listener = UnixListener::bind(&path)?;
         // The task may be another user's, and in a container anybody's: the token says who it is.
-        fs::set_permissions(&path, fs::Permissions::from_mode(0o666))?;
+        let listener = socket::listen(&path, 0o666)?;
         let serving = tokio::spawn(serve(desks, uid, listener, token));
         Ok(Seat { _serving: AbortOnDropHandle::new(serving) })
     }

@@ -1,9 +1,6 @@
 //! The gate's sockets: the tasks' and the agent's. They bring what is said to the hall, in order, and take back what it answers.
 
-use std::fs;
 use std::io;
-use std::os::unix::fs::PermissionsExt;
-use std::path::Path;
 use std::time::Duration;
 
 use muster_agent_core::gate::Conn;
@@ -31,17 +28,6 @@ pub(super) const ANSWERS: usize = 64;
 
 /// A connection's way back. Dropped: the connection ends.
 pub(super) type Back<M> = mpsc::Sender<M>;
-
-/// Listens at `path`, for those who may write to a file of `mode`.
-pub(crate) fn listen(path: &Path, mode: u32) -> io::Result<UnixListener> {
-    match fs::remove_file(path) {
-        Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(error),
-        _ => {}
-    }
-    let listener = UnixListener::bind(path)?;
-    fs::set_permissions(path, fs::Permissions::from_mode(mode))?;
-    Ok(listener)
-}
 
 /// Takes tasks in until dropped. That one is gone is `urgent`.
 pub(super) async fn tasks(

@@ -25,6 +25,7 @@ use super::record::{self, Record};
 use super::settings::Settings;
 use super::{AGENT_SOCKET, GateError, LOG, SOCKET, TASKS_DIR, hook, keeper};
 use crate::clock;
+use crate::socket;
 
 /// Inputs that may wait. Whoever says more waits until they were looked at.
 const INPUTS: usize = 256;
@@ -115,10 +116,10 @@ pub(super) async fn serve(dir: PathBuf, settings: Settings) -> Result<(), GateEr
     let system = |what| move |source| GateError::System { what, source };
     let kept = record::read(&dir)?;
     let mut end = signal(SignalKind::terminate()).map_err(system("hear signals"))?;
-    let tasks = door::listen(&dir.join(TASKS_DIR).join(SOCKET), 0o666)
+    let tasks = socket::listen(&dir.join(TASKS_DIR).join(SOCKET), 0o666)
         .map_err(system("listen for tasks"))?;
     let agents =
-        door::listen(&dir.join(AGENT_SOCKET), 0o600).map_err(system("listen for agents"))?;
+        socket::listen(&dir.join(AGENT_SOCKET), 0o600).map_err(system("listen for agents"))?;
     let (inputs, mut calls) = mpsc::channel(INPUTS);
     let (urgently, mut urgent) = mpsc::channel(INPUTS);
     let (core, response) = Gate::start(settings.core(), kept);
@@ -179,6 +180,7 @@ impl Hall {
         let mut looks = tokio::time::interval(STUCK / 4);
         looks.set_missed_tick_behavior(MissedTickBehavior::Delay);
         let mut log = Log::new(self.dir.join(LOG));
+        let mut looked = Instant::now();
         loop {
             // Cancel-safe: a signal, receivers, a sleep, the record and a tick. In the order of what they are worth: a task that
             // says much is not before a button. What tasks say waits until the record is durable.
@@ -190,6 +192,11 @@ impl Hall {
                 waited = self.record.written() => self.written(waited),
                 _ = looks.tick() => {
                     log.look();
+                    if looked.elapsed() > STUCK / 2 {
+                        // It stood still itself: what was said meanwhile is not read yet.
+                        self.heard = Instant::now();
+                    }
+                    looked = Instant::now();
                     if self.agent.is_some() && self.heard.elapsed() > STUCK {
                         tracing::warn!("the agent says nothing");
                         // Its connection ends with its way back; it comes again when it can.
@@ -555,15 +562,17 @@ mod tests {
             });
             let (stream, _) = listener.accept().await.unwrap();
             let (back, answers) = mpsc::channel(8);
-            let (agent, _status) = mpsc::channel(64);
-            let (admit, admitted): (_, Receiver<()>) = oneshot::channel();
-            urgent.send(Input::AgentCame(1, agent)).await.unwrap();
-            urgent.send(wanted(6)).await.unwrap();
-            let opened = Input::Opened { conn: HOLDER, token: "key".to_owned(), back, admit };
-            calls.send(opened).await.unwrap();
-            admitted.await.unwrap();
             let driver = BufReader::new(stream).lines();
             let mut scene = Scene { urgent, calls, driver, answers, disk, _dir: dir };
+            // Before all that follows the hall hears that its driver is there: it stops it, and drops what waits for it.
+            scene.hears("stop").await;
+            let (agent, _status) = mpsc::channel(64);
+            let (admit, admitted): (_, Receiver<()>) = oneshot::channel();
+            scene.urgent.send(Input::AgentCame(1, agent)).await.unwrap();
+            scene.urgent.send(wanted(6)).await.unwrap();
+            let opened = Input::Opened { conn: HOLDER, token: "key".to_owned(), back, admit };
+            scene.say(opened).await;
+            admitted.await.unwrap();
             assert!(scene.answers.recv().await.is_some(), "it is registered");
             scene.say(command(1, &[], "go")).await;
             assert_eq!(scene.answer().await, (1, proto::Verdict::Ok));
@@ -615,7 +624,7 @@ mod tests {
 
     #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
     async fn nor_does_a_stop_for_a_holder_that_is_gone_or_silent() {
-        let silent = &[Step { after_ms: 100, action: Action::Stop }];
+        let silent = &[Step { after_ms: 1_000, action: Action::Stop }];
         for steps in [PATIENT, silent] {
             let mut scene = Scene::start(steps).await;
             let disk = Arc::clone(&scene.disk);

@@ -102,7 +102,10 @@ pub(crate) struct Container {
     pub(crate) mounts: Vec<Mount>,
     pub(crate) network: Network,
     pub(crate) pull: Pull,
-    /// The image's user, when it is given by number and files are to be its own.
+    /// `UID` or `UID:GID`; none: the image's user.
+    #[serde(default)]
+    pub(crate) run_as: Option<String>,
+    /// Whom it runs as, when that is said by number and something is to be its own.
     #[serde(default)]
     pub(crate) user: Option<(u32, u32)>,
 }

@@ -10,8 +10,7 @@
 use std::collections::BTreeMap;
 use std::fs;
 use std::io;
-use std::os::fd::AsRawFd as _;
-use std::os::unix::fs::{DirBuilderExt as _, PermissionsExt as _};
+use std::os::unix::fs::DirBuilderExt as _;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
@@ -29,15 +28,13 @@ use super::Sensors;
 use super::channel::{Channel, Stand};
 use super::talk::{self, Owner};
 use crate::durable::{self, Keep};
+use crate::socket;
 
 /// How the sources stand, for those who do not connect.
 const STATUS: &str = "status.json";
 
 /// Connections at once to one function, of one task.
 const MOST: usize = 128;
-
-/// A path that the kernel takes for a socket, bytes.
-const LONGEST_PATH: usize = 107;
 
 /// The sockets of a task. Dropped: nobody listens any more, connections end, and its sources are wanted by others only.
 #[derive(Debug)]
@@ -66,7 +63,8 @@ impl Seat {
             if let Some(parent) = path.parent() {
                 make(parent)?;
             }
-            let listener = listen(&path)?;
+            // The task may be another user's, and in a container anybody's: the kernel and the token say who it is.
+            let listener = socket::listen(&path, 0o666)?;
             let door = talk::Door {
                 channel: Arc::clone(channel),
                 owner: Arc::clone(&owner),
@@ -86,24 +84,6 @@ fn make(dir: &Path) -> io::Result<()> {
         Err(error) if error.kind() == io::ErrorKind::AlreadyExists => Ok(()),
         made => made,
     }
-}
-
-fn listen(path: &Path) -> io::Result<UnixListener> {
-    match fs::remove_file(path) {
-        Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(error),
-        _ => {}
-    }
-    let listener = match (path.parent(), path.file_name()) {
-        (Some(dir), Some(name)) if path.as_os_str().len() > LONGEST_PATH => {
-            let dir = fs::File::open(dir)?;
-            let short = PathBuf::from(format!("/proc/self/fd/{}", dir.as_raw_fd()));
-            UnixListener::bind(short.join(name))?
-        }
-        _ => UnixListener::bind(path)?,
-    };
-    // The task may be another user's, and in a container anybody's: the kernel and the token say who it is.
-    fs::set_permissions(path, fs::Permissions::from_mode(0o666))?;
-    Ok(listener)
 }
 
 async fn serve(listener: UnixListener, door: Arc<talk::Door>) {

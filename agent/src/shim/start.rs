@@ -48,7 +48,7 @@ impl fmt::Display for StartError {
 }
 
 /// Steps in the child, told to the parent by number.
-const STEPS: [&str; 8] = [
+const STEPS: [&str; 9] = [
     "execute",
     "enter its control group",
     "make its session",
@@ -57,6 +57,7 @@ const STEPS: [&str; 8] = [
     "enter its working directory",
     "reset its signals",
     "tie it to the agent",
+    "give up new privileges",
 ];
 
 #[derive(Debug)]
@@ -199,6 +200,7 @@ impl Child {
             Child::enter_dir,
             Child::reset_signals,
             Child::tie,
+            Child::renounce,
         ]) {
             if !done(self) {
                 let error = io::Error::last_os_error();
@@ -258,6 +260,12 @@ impl Child {
 }
 
 impl Child {
+    /// No program that it runs gains what it has not: `setuid` bits and capabilities of files count for nothing.
+    fn renounce(&self) -> bool {
+        // SAFETY: numbers only.
+        unsafe { libc::prctl(libc::PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0) == 0 }
+    }
+
     /// The shim blocks what it reads from a descriptor, and may itself have been started with signals
     /// ignored. Both pass through exec, and a program that never hears SIGTERM would always be killed.
     fn reset_signals(&self) -> bool {

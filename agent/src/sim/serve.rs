@@ -16,7 +16,7 @@ use super::robot::Robot;
 use super::settings::Settings;
 use super::{CAMERA, DRIVE, LASER, STATE, SimError};
 use crate::durable::FileError;
-use crate::gate::door::listen;
+use crate::socket::listen;
 
 /// A simulator to which nobody is connected ends after this; a restarted agent is back sooner.
 pub(super) const LINGERS: Duration = Duration::from_secs(60);

@@ -38,11 +38,15 @@ impl Framework {
         framework
     }
 
-    /// Connects to the executor `exec`, and goes on until messages go directly both ways.
+    /// Connects to the executor `exec` once its ticket is known there, and goes on until messages go directly both ways.
     #[track_caller]
     pub fn come(controller: &Controller, line: u64, secret: [u8; 32]) -> Framework {
-        let mut framework = Framework::dial(controller, true, line, secret);
-        assert_eq!(framework.hear(), Some((Header::bare(Kind::Welcome, line), Vec::new())));
+        let mut framework = until("to be let in", || {
+            let mut framework = Framework::dial(controller, true, line, secret);
+            let first = framework.hear()?;
+            assert_eq!(first, (Header::bare(Kind::Welcome, line), Vec::new()));
+            Some(framework)
+        });
         until("the agent's mark", || {
             controller.messages().iter().any(|message| message.mark == line).then_some(())
         });

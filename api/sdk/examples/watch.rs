@@ -24,11 +24,11 @@ async fn main() -> Result<(), Box<dyn std::error::Error>> {
     loop {
         let frame = sensor.next().await?;
         let age = frame.stamp.elapsed().unwrap_or_default().as_secs_f64() * 1e3;
+        let (sequence, length, dropped) = (frame.sequence, frame.data.len(), frame.dropped);
+        // Numbers begin anew with each life of the agent.
+        let life = sensor.life();
         println!(
-            "{} {} bytes, {} dropped before, {age:.1} ms old",
-            frame.sequence,
-            frame.data.len(),
-            frame.dropped
+            "{sequence} {length} bytes, {dropped} dropped before, {age:.1} ms old, life {life}"
         );
         if let Some(pause) = pause {
             tokio::time::sleep(pause).await;

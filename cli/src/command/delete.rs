@@ -247,8 +247,11 @@ mod tests {
             "{error}"
         );
         assert_eq!(fake.run(&["delete", "task/a", "--wait=false"]).await.0, exit::OK);
+        let asked = fake.requests().len();
         let (done, ()) = tokio::join!(fake.run(&["delete", "task/a"]), async {
-            tokio::time::sleep(std::time::Duration::from_millis(50)).await;
+            while !fake.requests()[asked..].iter().any(|request| request.starts_with("DELETE")) {
+                tokio::time::sleep(std::time::Duration::from_millis(1)).await;
+            }
             fake.remove("tasks/default/a");
         });
         assert_eq!(done.0, exit::OK);

@@ -473,7 +473,9 @@ mod tests {
         assert_eq!(fake.run(&["wait", "task/a", "--for=delete"]).await.0, exit::OK);
         fake.put("tasks/default/a", task("a", json!({})));
         let (done, ()) = tokio::join!(fake.run(&["wait", "task/a", "--for=delete"]), async {
-            tokio::time::sleep(std::time::Duration::from_millis(30)).await;
+            while !fake.requests().iter().any(|request| request.contains("watch=true")) {
+                tokio::time::sleep(std::time::Duration::from_millis(1)).await;
+            }
             fake.remove("tasks/default/a");
         });
         assert_eq!(done, (exit::OK, "task/a is gone\n".to_owned()));

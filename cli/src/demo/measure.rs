@@ -51,20 +51,19 @@ impl Track {
         self.seen = Some(usec);
     }
 
-    /// Cores: the slope of the line that fits best. None: less than three samples.
+    /// Cores: the median of the slopes between all pairs of samples (Theil and Sen's estimator). A moment in which the machine
+    /// stood still bends a line of least squares, and not this. None: less than three samples.
     pub(super) fn slope(&self) -> Option<f64> {
         let n = self.samples.len();
         if n < 3 {
             return None;
         }
-        let mean = |of: fn(&(f64, f64)) -> f64| self.samples.iter().map(of).sum::<f64>() / n as f64;
-        let (t, c) = (mean(|s| s.0), mean(|s| s.1));
-        let (mut above, mut below) = (0.0, 0.0);
-        for sample in &self.samples {
-            above += (sample.0 - t) * (sample.1 - c);
-            below += (sample.0 - t).powi(2);
-        }
-        (below > 0.0).then(|| above / below)
+        let pairs =
+            (0..n).flat_map(|i| (i + 1..n).map(move |j| (self.samples[i], self.samples[j])));
+        let slope = |(a, b): ((f64, f64), (f64, f64))| (b.1 - a.1) / (b.0 - a.0);
+        let mut slopes: Vec<f64> = pairs.filter(|(a, b)| b.0 > a.0).map(slope).collect();
+        slopes.sort_by(f64::total_cmp);
+        slopes.get(slopes.len() / 2).copied()
     }
 }
 

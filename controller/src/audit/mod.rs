@@ -51,7 +51,7 @@ const REFUSED: Bound = Bound { name: "refused.jsonl", bytes: 16 << 20, files: 2 
 /// Lines that wait for the disk; more are missing. Some megabytes.
 const QUEUE: usize = 4096;
 /// A line that is not written by then is answered as one that is missing. A disk that works takes a thousandth of it.
-const PATIENCE: Duration = Duration::from_secs(2);
+const PATIENCE: Duration = Duration::from_secs(if cfg!(test) { 60 } else { 2 });
 /// Longest name in a line, bytes: none that is taken is longer, and what was refused may be a megabyte.
 const LONGEST: usize = 253;
 

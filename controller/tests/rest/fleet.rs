@@ -150,7 +150,7 @@ async fn thirty_robots_are_changed_one_fails_and_one_is_on_a_mission() {
     assert_eq!(touched, BTreeSet::from([&WEAK.to_owned()]), "the others are untouched");
     assert!(after.values().all(|(_, command)| command == "steady"), "{after:?}");
 
-    deadline(&admin, 6).await;
+    deadline(&admin, 20).await;
     command(&admin, "deaf").await;
     let given_up = rollout(&cluster, "RolledBack", 0).await;
     let why = &given_up["status"]["rolledBackFrom"];

@@ -70,7 +70,8 @@ async fn it_goes_from_node_to_node_under_new_uids_and_ends_with_what_was_tried()
     let cluster = Cluster::start().await;
     let admin = cluster.admin().await;
     let mut robots = robots(&cluster).await;
-    let block = json!({"maxAttempts": 4, "attemptsPerNode": 2, "backoff": "200ms"});
+    let block =
+        json!({"maxAttempts": 4, "attemptsPerNode": 2, "backoff": "3s", "maxBackoff": "3s"});
     let mut task = retried(block);
     task["spec"]["restartPolicy"] = "OnFailure".into();
     let (code, answer) = send(&admin, "POST", TASKS, task).await;

@@ -55,8 +55,8 @@ async fn a_watch_begins_where_it_is_told_to() {
     assert_eq!(all.event().await, "DELETED a");
     assert_eq!(since.event().await, "DELETED a");
     assert_eq!(single.event().await, "DELETED b");
-    cluster.running.shut_down().await.unwrap();
     assert_eq!(all.event().await, "DELETED b");
+    cluster.running.shut_down().await.unwrap();
     assert!(all.next().await.is_none(), "a shutdown ends watches");
 }
 
@@ -219,7 +219,7 @@ async fn a_watch_ends_with_the_token_or_the_right_that_opened_it() {
     });
     assert_eq!(send(&admin, "POST", &format!("{G}/accesses"), access).await.0, 201);
     send(&admin, "POST", EVENTS, event("a")).await;
-    let (made, short) = (cluster.token("ada", 3600).await, cluster.token("ada", 5).await);
+    let made = cluster.token("ada", 3600).await;
     let client =
         async |made: &Value| cluster.bearer(made["status"]["token"].as_str().unwrap()).await;
     let watch = async |client: &Client| {
@@ -227,10 +227,12 @@ async fn a_watch_ends_with_the_token_or_the_right_that_opened_it() {
         assert_eq!(watch.event().await, "ADDED a");
         watch
     };
-    let expires = watch(&client(&short).await).await;
     let deleted = watch(&client(&made).await).await;
     let denied = watch(&cluster.user("ada").await).await;
     let mut goes_on = watch(&admin).await;
+    // Made last: its watch has to begin while it holds.
+    let short = cluster.token("ada", 15).await;
+    let expires = watch(&client(&short).await).await;
     let ends = async |mut watch: Lines| {
         let next = tokio::time::timeout(DEADLINE, watch.next()).await.expect("the watch ends");
         assert_eq!(next, None);

@@ -100,6 +100,9 @@ pub(crate) struct Shared {
     bus: Bus,
     /// There is something for the registrar to do.
     work: Notify,
+    /// Held while the master is asked. Who takes back what is registered has it first: a master answers connections side by
+    /// side, and a registration that was under way could come after.
+    turn: tokio::sync::Mutex<()>,
     state: watch::Sender<MasterState>,
     /// Why somebody wanted this node to end.
     ended: watch::Sender<Option<String>>,
@@ -199,6 +202,7 @@ impl Node {
             topics: Mutex::default(),
             bus: Bus::default(),
             work: Notify::new(),
+            turn: tokio::sync::Mutex::new(()),
             state: watch::Sender::new(MasterState::Unknown),
             ended: watch::Sender::new(None),
         });
@@ -380,7 +384,9 @@ impl Node {
         leaving.extend(publications.into_keys().map(Leaving::Publication));
         leaving.extend(params.into_keys().map(Leaving::Param));
         // The registrar must not register again what is taken back here.
+        let turn = tokio::time::timeout(FAREWELL, self.shared.turn.lock()).await;
         drop(self.tasks);
+        drop(turn);
         let all = async {
             for one in leaving {
                 if registrar::take_back(&self.shared, &one).await.is_err() {

@@ -38,7 +38,10 @@ pub(super) async fn run(shared: Arc<Shared>) {
     loop {
         let whole = rounds.is_multiple_of(WHOLE);
         let begun = Instant::now();
-        let state = match round(&shared, whole).await {
+        let turn = shared.turn.lock().await;
+        let asked = round(&shared, whole).await;
+        drop(turn);
+        let state = match asked {
             Ok(()) => MasterState::Registered,
             Err(error) => {
                 forget(&shared);

@@ -179,7 +179,7 @@ async fn start(cluster: &Cluster, readers: usize, command: &[&str], sensors: Val
 async fn said(cluster: &Cluster, readers: usize) -> Result<Vec<Value>, String> {
     let mut all = Vec::new();
     for reader in 0..readers {
-        let log = cluster.task_log(&format!("r{reader}")).await;
+        let log = cluster.try_task_log(&format!("r{reader}")).await?;
         let whole = log.rsplit_once('\n').map_or("", |(whole, _)| whole);
         let last = whole.lines().last().and_then(|line| serde_json::from_str(line).ok());
         all.push(last.ok_or_else(|| format!("r{reader}: {log}"))?);

@@ -3,27 +3,35 @@
 //! Random bytes do not get past the first line of a parser; a manifest with one value that is too large does. In a test that is a target stands:
 //!
 //! ```no_run
-//! bolero::check!()
-//!     .with_generator(muster_hostile::inputs("quantities"))
-//!     .with_test_time(muster_hostile::test_time())
-//!     .for_each(|bytes: &Vec<u8>| assert!(String::from_utf8_lossy(bytes).parse::<u8>().is_err()));
+//! let inputs = muster_hostile::inputs("quantities");
+//! muster_hostile::feed(bolero::check!(), inputs, |bytes| {
+//!     assert!(String::from_utf8_lossy(bytes).parse::<u8>().is_err());
+//! });
 //! ```
 //!
-//! Its seeds are the files of `seeds/NAME`, and those that it names beside. `cargo test` gives each a few seconds
-//! ([`test_time`]); bolero shrinks what makes one fail and prints it: it belongs among the seeds then. The same targets
-//! run under bolero's other engines, which are guided by coverage: `cargo bolero test -e libfuzzer …`.
+//! Its seeds are the files of `seeds/NAME`, and those that it names beside. `cargo test` gives each the same inputs every
+//! time: a change that fails is what made it fail. With [`SECONDS`] bolero's engine makes others for so long. What makes a
+//! target fail is shrunk and printed: it belongs among the seeds then. The same targets run under bolero's other engines,
+//! which are guided by coverage: `MUSTER_HOSTILE_SECONDS=0 cargo bolero test -e libfuzzer …`.
+
+mod same;
 
 use std::fs;
+use std::panic::RefUnwindSafe;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use bolero::{Driver, ValueGenerator};
+use bolero::{
+    BorrowedInput, ByteSliceGenerator, DefaultEngine, Driver, TestTarget, ValueGenerator,
+};
 
-/// Seconds for each target, when the environment says so.
+use same::Same;
+
+/// The variable of the environment that gives each target so many seconds, and inputs that nobody has seen.
 pub const SECONDS: &str = "MUSTER_HOSTILE_SECONDS";
 
-/// For each target, seconds.
-const USUAL: u64 = 5;
+/// Without it: so many for each target as most get through in a few seconds in a debug build.
+const USUAL: Same = Same { inputs: 20_000, at_most: Duration::from_secs(10) };
 
 /// Edits of a seed.
 const EDITS: usize = 6;
@@ -95,16 +103,25 @@ pub fn inputs(name: &str) -> Inputs {
     Inputs(Vec::new()).and_those_in(&Path::new(env!("CARGO_MANIFEST_DIR")).join("seeds").join(name))
 }
 
-/// How long each target runs.
+/// Gives inputs to a target: always the same ones, or for as long as the environment says ([`SECONDS`]).
 ///
 /// # Panics
 ///
-/// When the environment says something that is no number.
-#[must_use]
-pub fn test_time() -> Duration {
-    let seconds =
-        std::env::var(SECONDS).ok().map(|text| text.parse().expect("a number of seconds"));
-    Duration::from_secs(seconds.unwrap_or(USUAL))
+/// When the target does, or the environment says something that is no number.
+pub fn feed<F>(
+    target: TestTarget<ByteSliceGenerator, DefaultEngine, BorrowedInput>,
+    inputs: Inputs,
+    test: F,
+) where
+    F: FnMut(&Vec<u8>) + RefUnwindSafe,
+{
+    match std::env::var(SECONDS) {
+        Ok(text) => {
+            let time = Duration::from_secs(text.parse().expect("a number of seconds"));
+            target.with_generator(inputs).with_test_time(time).for_each(test);
+        }
+        Err(_) => TestTarget::new(USUAL).with_generator(inputs).for_each(test),
+    }
 }
 
 impl Inputs {
@@ -206,12 +223,11 @@ mod tests {
     fn inputs_are_seeds_and_what_is_near_them() {
         let seeds = || Inputs(Vec::new()).and([b"cpu: 500m".to_vec(), b"memory: 1Gi".to_vec()]);
         let made = Mutex::new(BTreeSet::new());
-        bolero::check!().with_generator(seeds()).with_iterations(2_000).for_each(
-            |bytes: &Vec<u8>| {
-                assert!(bytes.len() <= LONGEST);
-                made.lock().unwrap().insert(bytes.clone());
-            },
-        );
+        let many = Same { inputs: 2_000, at_most: Duration::MAX };
+        TestTarget::new(many).with_generator(seeds()).for_each(|bytes: &Vec<u8>| {
+            assert!(bytes.len() <= LONGEST);
+            made.lock().unwrap().insert(bytes.clone());
+        });
         let made = made.into_inner().unwrap();
         assert!(seeds().0.iter().all(|seed| made.contains(seed)), "seeds as they are");
         assert!(made.len() > 1_000, "{}", made.len());

@@ -117,7 +117,12 @@ async fn from_plan_to_delete() {
     );
     let (_, described, _) = muster(&cluster, &["describe", "node", "robot"]);
     assert!(described.contains("kinect:ImageGen") && described.contains("first"), "{described}");
-    assert_eq!(muster(&cluster, &["logs", "first"]).1, "at the wheel\n");
+    // It runs a moment before it says it.
+    wait::until("its log", || async {
+        let (_, log, err) = muster(&cluster, &["logs", "first"]);
+        if log == "at the wheel\n" { Ok(()) } else { Err(format!("{log:?} {err}")) }
+    })
+    .await;
 
     assert_eq!(muster(&cluster, &["get", "task", "none"]).0, 3, "not found");
     assert_eq!(muster(&cluster, &["delete", "task", "first"]).0, 0);

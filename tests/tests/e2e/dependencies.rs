@@ -2,7 +2,8 @@
 
 use muster_api::kind::task::TaskStatus;
 use muster_api::phase::TaskPhase;
-use muster_tests::{AgentOptions, Cluster, kernel, wait};
+use muster_tests::kernel::{self, Process};
+use muster_tests::{AgentOptions, Cluster, wait};
 use serde_json::{Value, json};
 
 fn sleeper(more: Value) -> Value {
@@ -88,11 +89,25 @@ async fn the_order_holds_without_a_controller() {
     std::fs::remove_file(&ready).expect("it is there");
     let of = |task: &str| kernel::with_env("MUSTER_UID", task);
     let (camera, detector) = (uid(&camera), uid(&detector));
+    let mut old = Vec::new();
+    let mut kill = |process: Process| {
+        kernel::kill(process.pid);
+        old.push(process);
+    };
     for task in [&camera, &detector] {
         // The shims, whose arguments name the task's directory, and then what they ran.
-        kernel::with_command(task).into_iter().for_each(kernel::kill);
-        of(task).into_iter().for_each(|process| kernel::kill(process.pid));
+        let shims = kernel::with_command(task).into_iter();
+        let shims = shims.filter_map(|pid| Some(Process { pid, start: kernel::start_time(pid)? }));
+        shims.for_each(&mut kill);
+        of(task).into_iter().for_each(&mut kill);
     }
+    // What was killed is there until the kernel comes to it, and would be taken for what begins now.
+    wait::until("all of it dead", || async {
+        let lives = |p: &&Process| kernel::start_time(p.pid) == Some(p.start);
+        let left: Vec<_> = old.iter().filter(lives).collect();
+        if left.is_empty() { Ok(()) } else { Err(format!("{left:?}")) }
+    })
+    .await;
     cluster.spawn_agent("robot", None);
     let runs = |task: String| async move {
         let found = kernel::with_env("MUSTER_UID", &task);

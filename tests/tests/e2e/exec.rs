@@ -230,16 +230,19 @@ async fn what_cannot_be_entered_says_why() {
 
     // So many at once, and no more; there is room again when one has ended.
     let mut all = Vec::new();
-    for _ in 0..31 {
+    for n in 1..=31_usize {
         all.push(start(&cluster, &["exec", "t", "--", "sleep", "4031"]));
-    }
-    wait::until("all of them", || async {
-        match running("4031").len() {
-            31 => Ok(()),
-            n => Err(format!("{n}")),
+        if n.is_multiple_of(4) || n == 31 {
+            // A machine of two cores is not to be asked for more handshakes at once than it makes in time.
+            wait::until("so many", || async {
+                match running("4031").len() {
+                    m if m == n => Ok(()),
+                    m => Err(format!("{m} of {n}")),
+                }
+            })
+            .await;
         }
-    })
-    .await;
+    }
     // 31 programs, and the one that is attached.
     let (code, _, err) = muster(&cluster, &["exec", "t", "--", "true"]);
     assert!(code != 0 && err.contains("clients run 32 programs"), "{code}: {err}");

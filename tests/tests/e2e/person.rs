@@ -31,8 +31,9 @@ async fn who_takes_a_robot_has_it_before_the_answer() {
         "{}",
         taken.2
     );
+    // The driver has it by now, and writes it down a moment later.
+    robot.wait("stop").await;
     let heard = robot.heard();
-    assert_eq!(heard.last().map(String::as_str), Some("stop"), "the robot stands at the answer");
     let held = lease(&cluster).await.status.expect("a status");
     let holder = held.holder.map(|holder| holder.to_string());
     assert_eq!((held.epoch.0, holder.as_deref()), (2, Some("user admin")));
@@ -54,7 +55,9 @@ async fn who_takes_a_robot_has_it_before_the_answer() {
     cluster.kill_controller();
     cluster.start_controller().await;
     condition(&cluster, "Ready", "True").await;
-    assert_eq!(robot.heard(), heard, "it stood all the time");
+    // It may be told to stop again.
+    let since = robot.heard().split_off(heard.len());
+    assert!(since.iter().all(|word| word == "stop"), "it stood all the time: {since:?}");
     assert_eq!(lease(&cluster).await.status.map(|s| s.epoch.0), Some(2));
 
     let back = muster(&cluster, &["lease", "return", "robot"]);

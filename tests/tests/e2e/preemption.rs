@@ -10,7 +10,7 @@ fn driver(script: &str, priority: i32) -> Value {
         "resources": {"actuators": ["base:Drive"], "cpu": "100m"},
         "run": {"process": {"command": ["sh", "-c", script]}},
         // So long, in which it is seen that the place is being made.
-        "gracePeriodSeconds": 10,
+        "gracePeriodSeconds": 20,
     })
 }
 

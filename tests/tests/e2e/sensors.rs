@@ -71,7 +71,10 @@ async fn create(cluster: &Cluster, name: &str, spec: Value) -> Task {
 
 /// What a reader has said so far.
 async fn said(cluster: &Cluster, task: &str) -> Vec<Value> {
-    let log = cluster.task_log(task).await;
+    words(&cluster.task_log(task).await)
+}
+
+fn words(log: &str) -> Vec<Value> {
     let whole = log.rsplit_once('\n').map_or("", |(whole, _)| whole);
     whole.lines().map(|line| serde_json::from_str(line).expect(line)).collect()
 }
@@ -84,7 +87,7 @@ async fn until(
     wanted: impl Fn(&[Value]) -> bool,
 ) -> Vec<Value> {
     wait::until(&format!("{task}: {what}"), async || {
-        let said = said(cluster, task).await;
+        let said = words(&cluster.try_task_log(task).await?);
         if wanted(&said) { Ok(said) } else { Err(format!("{:?}", said.last())) }
     })
     .await
@@ -281,13 +284,13 @@ async fn containers_and_other_users_read_too() {
     spec["run"]["process"] = json!({"command": [bin.join("watch"), IMAGE, "4"], "user": "nobody"});
     create(&cluster, "other", spec).await;
     for task in ["box", "other"] {
-        watched(&cluster, task, "three frames", |frames| frames.len() >= 3).await;
+        watched(&cluster, task, "three frames", |lives| lives.len() >= 3).await;
     }
-    // The agent of the next life is found by both; it counts anew.
+    // The agent of the next life is found by both.
     cluster.kill_agent("robot");
     cluster.restart_agent("robot").await;
     for task in ["box", "other"] {
-        let anew = |frames: &[u64]| frames.windows(2).any(|pair| pair[1] < pair[0]);
+        let anew = |lives: &[&str]| lives.windows(2).any(|pair| pair[0] != pair[1]);
         watched(&cluster, task, "another life", anew).await;
     }
     cluster.delete("box").await;
@@ -304,15 +307,18 @@ async fn told(path: &Path, words: &[&str]) {
     .await;
 }
 
-/// Waits until the numbers of the frames that `watch` has said are as wanted.
-async fn watched(cluster: &Cluster, task: &str, what: &str, wanted: impl Fn(&[u64]) -> bool) {
+/// Waits until the frames that `watch` has said are as wanted, each by the agent's life in which it came.
+async fn watched(cluster: &Cluster, task: &str, what: &str, wanted: impl Fn(&[&str]) -> bool) {
     wait::until(&format!("{task}: {what}"), async || {
-        let log = cluster.task_log(task).await;
+        let log = cluster.try_task_log(task).await?;
         let size = format!("{SIZE} bytes,");
-        let frames = log.lines().filter_map(|line| line.split_once(' '));
-        let frames = frames.filter(|(_, rest)| rest.starts_with(&size));
-        let frames: Vec<u64> = frames.filter_map(|(number, _)| number.parse().ok()).collect();
-        if wanted(&frames) { Ok(()) } else { Err(log) }
+        let whole = log.rsplit_once('\n').map_or("", |(whole, _)| whole);
+        let frames = whole.lines().filter_map(|line| line.split_once(' '));
+        let frames = frames.filter(|(number, _)| number.parse::<u64>().is_ok());
+        let frames = frames.filter_map(|(_, rest)| rest.strip_prefix(&size));
+        let lives: Vec<&str> =
+            frames.filter_map(|rest| rest.split_once(", life ")).map(|(_, life)| life).collect();
+        if wanted(&lives) { Ok(()) } else { Err(log) }
     })
     .await;
 }

@@ -106,9 +106,9 @@ async fn until_seen(cluster: &Cluster, task: &str, is: impl Fn(&Value) -> bool) 
     .await
 }
 
-/// A reader's newest word; what it has said when that is none.
+/// A reader's newest word; when that is none, what it has said, or why nobody knows.
 async fn newest(cluster: &Cluster, task: &str) -> Result<Value, String> {
-    let log = cluster.task_log(task).await;
+    let log = cluster.try_task_log(task).await?;
     let whole = log.rsplit_once('\n').map_or("", |(whole, _)| whole);
     let last = whole.lines().last().and_then(|line| serde_json::from_str(line).ok());
     last.ok_or(log)

@@ -73,8 +73,7 @@ async fn readiness_follows_a_topics_rate_and_two_probes_share_a_subscription() {
     fast.kill().await;
     let why = not_ready(&cluster, "watch", "/r1/chatter comes at").await;
     assert!(why.contains("Hz over 1 s, at least 8 are asked for"), "{why}");
-    let slow = cluster.tasks().await.get("slow").await.expect("it is there");
-    assert_eq!(slow.status.expect("it has one").ready, Some(true));
+    ready(&cluster, "slow").await;
     let _fast = publish(&ros, "20");
     ready(&cluster, "watch").await;
 }

@@ -38,6 +38,11 @@ const GATE_DIR: &str = "/run/muster-gate";
 /// The least cpu weight that the engine gives: that of a task which reserved none.
 const MIN_SHARES: i64 = 2;
 
+/// Of the capabilities that the engine gives to root in a container, those that let it make devices, forge packets, write
+/// the node's audit log, and hand capabilities on. What images do when they start (take files over, become another user,
+/// listen on a low port) they go on doing.
+const DROPPED: [&str; 6] = ["AUDIT_WRITE", "MKNOD", "NET_RAW", "SETFCAP", "SETPCAP", "SYS_CHROOT"];
+
 /// The least memory limit that the engine takes.
 const MIN_MEMORY: u64 = 6 << 20;
 
@@ -52,6 +57,13 @@ pub(super) fn body(launch: &Launch, config: &DockerConfig) -> Result<ContainerCr
         message: format!("failed to make {}: {error}", run_dir.display()),
         retry: true,
     })?;
+    if let Some((uid, gid)) = container.user {
+        std::os::unix::fs::chown(&run_dir, Some(uid), Some(gid)).map_err(|error| Failure {
+            reason: "NodeError".to_owned(),
+            message: format!("failed to hand over {}: {error}", run_dir.display()),
+            retry: true,
+        })?;
+    }
     let mut env = launch.env.clone();
     env.insert("MUSTER_RUN_DIR".to_owned(), RUN_DIR.to_owned());
     let socket = format!("{EXECUTOR_DIR}/{}", executor::SOCKET);
@@ -71,6 +83,7 @@ pub(super) fn body(launch: &Launch, config: &DockerConfig) -> Result<ContainerCr
         entrypoint: list(&container.command),
         cmd: list(&container.args),
         working_dir: container.working_dir.clone(),
+        user: container.run_as.clone(),
         env: Some(env.iter().map(|(name, value)| format!("{name}={value}")).collect()),
         labels: Some(labels(launch, config)),
         host_config: Some(host(launch, container, config, &run_dir.display().to_string())?),
@@ -134,6 +147,9 @@ fn host(
             .to_owned(),
         ),
         mounts: Some(mounts),
+        cap_drop: Some(DROPPED.map(str::to_owned).to_vec()),
+        // Beside the engine's own filter of system calls.
+        security_opt: Some(vec!["no-new-privileges:true".to_owned()]),
         // The engine's own bounds, like those of process tasks.
         log_config: Some(HostConfigLogConfig {
             typ: Some("json-file".to_owned()),

@@ -15,8 +15,8 @@ use super::hijack::{self, HijackError, Hijacked};
 use crate::exec::ends::{Ends, Input, Invocation, Outlet, Ran, Room};
 use crate::runtime::RuntimeError;
 
-/// The engine writes down how a program ended a moment after its streams have.
-const KNOWN_WITHIN: Duration = Duration::from_secs(2);
+/// The engine writes down how a program ended a moment after its streams have, or later when its disk is busy.
+const KNOWN_WITHIN: Duration = Duration::from_secs(30);
 
 /// How often the engine is told a terminal's size, as its own client does.
 const RESIZES: u32 = 10;
@@ -29,7 +29,7 @@ pub(super) async fn interact(
     container: &str,
     invocation: &Invocation,
     ends: Ends,
-    until: BoxFuture<'_, ()>,
+    mut until: BoxFuture<'_, ()>,
 ) -> Result<Ran, RuntimeError> {
     let config = ExecConfig {
         attach_stdin: Some(invocation.stdin),
@@ -55,14 +55,18 @@ pub(super) async fn interact(
     let passed = tokio::select! {
         passed = hijack::pass(output, !invocation.tty, &outlet) => Some(passed),
         () = feed.run(input, said) => None,
-        () = until => None,
+        () = &mut until => None,
     };
     let Some(passed) = passed else {
         kill(docker, &id).await;
         return Ok(Ran::Cut);
     };
     passed.map_err(failed)?;
-    Ok(exit_code(docker, &id).await.map_or(Ran::Cut, Ran::Ended))
+    let code = tokio::select! {
+        code = exit_code(docker, &id) => code,
+        () = until => None,
+    };
+    Ok(code.map_or(Ran::Cut, Ran::Ended))
 }
 
 /// The exit code of a program whose streams have ended; none: the engine does not know it, as of one that was killed with

@@ -55,6 +55,9 @@ use crate::runtime::launch::{Container, Network, Program, Pull};
 use engine::Engine;
 use inspect::Seen;
 
+/// Between an engine's hearing of a container's end and of why the kernel killed it.
+const HEARD_WITHIN: Duration = Duration::from_millis(200);
+
 /// What the runtime is made of.
 #[derive(Debug)]
 pub(crate) struct DockerConfig {
@@ -195,12 +198,15 @@ impl DockerRuntime {
         self.start(&docker, &name, launch).await
     }
 
-    /// The launch with the image's user, when there are files to be handed over to it. An image that is missing shows
-    /// when the container is created.
+    /// The launch with its user, or with the image's when there are files to be handed over to it. An image that is missing
+    /// shows when the container is created.
     async fn with_user(&self, docker: &Docker, launch: &Launch) -> Launch {
         let mut launch = launch.clone();
         let files = launch.given.as_ref().is_some_and(|given| !given.files.is_empty());
-        if let (Program::Container(container), true) = (&mut launch.program, files) {
+        let Program::Container(container) = &mut launch.program else { return launch };
+        if let Some(user) = &container.run_as {
+            container.user = create::user_ids(user);
+        } else if files {
             let image = docker.inspect_image(&container.image).await.ok();
             let user = image.and_then(|image| image.config?.user).unwrap_or_default();
             container.user = create::user_ids(&user);
@@ -276,6 +282,19 @@ impl DockerRuntime {
         Exit { disconnected, ..exit }
     }
 
+    /// An exit by SIGKILL, looked at once more: the engine hears that memory ran out and that the container ended by two ways.
+    async fn ended_by_kill(&self, name: &str, exit: Exit) -> Exit {
+        if exit.end != End::Signaled(libc::SIGKILL) || exit.oom_killed {
+            return exit;
+        }
+        tokio::time::sleep(HEARD_WITHIN).await;
+        let Ok(docker) = self.client() else { return exit };
+        match inspect::inspect(&docker, name).await {
+            Ok(Some(Seen::Ended(again))) => again,
+            _ => exit,
+        }
+    }
+
     async fn wait(&self, launch: &Launch) -> Exit {
         let id = &launch.id;
         let name = self.name(id);
@@ -290,6 +309,7 @@ impl DockerRuntime {
             match looked {
                 Ok(Some(Seen::Ended(exit))) => {
                     self.wait_empty(id).await;
+                    let exit = self.ended_by_kill(&name, exit).await;
                     self.live().remove(id);
                     return self.ended(id, exit);
                 }

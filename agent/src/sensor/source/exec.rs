@@ -35,9 +35,11 @@ pub(super) async fn run(argv: &[String], channel: &Channel, end: CancellationTok
     let errors = child.stderr.take();
     // Neither of the others is polled again after one has ended.
     let why = tokio::select! {
+        biased;
+        // What it said before it ended is there before its end.
+        () = listen(errors, &last) => None,
         () = end.cancelled() => None,
         why = output.frames(channel) => Some(why),
-        () = listen(errors, &last) => None,
     };
     drop(output);
     let ended = stop(child, why.is_none() || why.as_ref().is_some_and(Option::is_some)).await;

@@ -398,6 +398,10 @@ pub struct ContainerRun {
     /// When the image is pulled.
     #[serde(default)]
     pub pull_policy: PullPolicy,
+    /// The user that it runs as, `UID` or `UID:GID`: names mean something inside of an image only. None: the image's, which
+    /// is root where the image says nothing.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub user: Option<String>,
 }
 
 /// A process.

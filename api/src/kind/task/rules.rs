@@ -218,6 +218,11 @@ fn run_rules(run: &Run, violations: &mut Violations) {
             absolute(&format!("{path}.hostPath"), Some(&mount.host_path), violations);
             absolute(&format!("{path}.mountPath"), Some(&mount.mount_path), violations);
         }
+        if let Some(user) = container.user.as_deref().filter(|user| !is_numbers(user)) {
+            violations
+                .invalid("spec.run.container.user", format!("{user:?} is no UID or UID:GID"))
+                .suggest("for example \"1000\"; names mean something inside of an image only");
+        }
     }
     if let Some(process) = &run.process {
         if process.command.first().is_none_or(|c| c.is_empty()) {
@@ -234,6 +239,14 @@ fn run_rules(run: &Run, violations: &mut Violations) {
     {
         violations.invalid("spec.run.executor.task", error.to_string());
     }
+}
+
+/// `UID` or `UID:GID`.
+fn is_numbers(user: &str) -> bool {
+    let (uid, gid) = user.split_once(':').unwrap_or((user, "0"));
+    [uid, gid]
+        .into_iter()
+        .all(|id| id.bytes().all(|b| b.is_ascii_digit()) && id.parse::<u32>().is_ok())
 }
 
 fn absolute(path: &str, given: Option<&str>, violations: &mut Violations) {

@@ -131,6 +131,16 @@ fn container(spec: &TaskSpec) -> Value {
     if let Some(dir) = dir {
         container["workingDir"] = dir.as_str().into();
     }
+    // Names of users, which processes may have, are nothing that a pod could say.
+    let user = spec.run.container.as_ref().and_then(|run| run.user.as_deref());
+    if let Some(user) = user {
+        let (uid, gid) = user.split_once(':').map_or((user, None), |(uid, gid)| (uid, Some(gid)));
+        for (field, id) in [("runAsUser", Some(uid)), ("runAsGroup", gid)] {
+            if let Some(id) = id.and_then(|id| id.parse::<u32>().ok()) {
+                container["securityContext"][field] = id.into();
+            }
+        }
+    }
     container
 }
 

@@ -57,8 +57,8 @@ pub struct TaskView {
     pub finished: Option<Timestamp>,
     /// Number of the attempt.
     pub attempt: u32,
-    /// An attempt of it has ended by itself, with a code or by a signal.
-    pub exited: bool,
+    /// How an attempt of it has ended by itself; none: none has.
+    pub exited: Option<String>,
     /// What its start-up and readiness probes say; none: it has neither.
     pub ready: Option<bool>,
     /// Since when they say that it is ready, by the controller's clock.
@@ -104,7 +104,11 @@ impl TaskView {
             started: status.started_at.map(|t| t.0),
             finished: status.finished_at.map(|t| t.0),
             attempt: status.attempt,
-            exited: status.exit_code.is_some() || status.signal.is_some(),
+            exited: match (status.exit_code, status.signal) {
+                (Some(code), _) => Some(format!("exited with code {code}")),
+                (None, Some(signal)) => Some(format!("ended by signal {signal}")),
+                (None, None) => None,
+            },
             ready: status.ready,
             ready_since: status.ready_at.map(|t| t.0),
             ending: task.metadata.deletion_timestamp.is_some(),

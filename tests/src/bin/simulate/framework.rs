@@ -92,7 +92,7 @@ pub(crate) struct Framework {
     pub(crate) retired: bool,
     session: Option<Session>,
     /// What arrived while it was frozen.
-    unread: Vec<(Conn, Down)>,
+    unread: Vec<(u64, Conn, Down)>,
     /// When it last heard of the controller in a session.
     heard: u64,
     /// What it heard then may be old: it may have been given up before.
@@ -183,8 +183,8 @@ impl Framework {
             }
             Deed::Thaw => {
                 self.frozen = false;
-                for (conn, what) in std::mem::take(&mut self.unread) {
-                    self.hear(conn, what, hands);
+                for (came, conn, what) in std::mem::take(&mut self.unread) {
+                    self.read((came, conn), what, hands);
                 }
             }
             Deed::Dial(life) | Deed::Look(life, _) if life != self.lives || !self.up => {}
@@ -337,8 +337,13 @@ impl Framework {
     /// Something of the controller arrives.
     pub(crate) fn hear(&mut self, conn: Conn, what: Down, hands: &mut Hands<'_>) {
         if self.frozen {
-            return self.unread.push((conn, what));
+            return self.unread.push((hands.now, conn, what));
         }
+        self.read((hands.now, conn), what, hands);
+    }
+
+    /// Reads what came at a time: of what is read later the controller may be long past.
+    fn read(&mut self, (came, conn): (u64, Conn), what: Down, hands: &mut Hands<'_>) {
         let Some(session) = self.session.as_mut().filter(|session| session.conn == conn) else {
             return;
         };
@@ -351,7 +356,7 @@ impl Framework {
         let subscribed = session.subscribed;
         if subscribed {
             self.doubt |= self.is_away(hands.now);
-            self.heard = hands.now;
+            self.heard = came;
         }
         match event {
             Some(Hear::Subscribed(subscribed)) => self.is_subscribed(subscribed, hands),

@@ -65,6 +65,8 @@ pub(crate) struct Truth {
     pub(crate) names: BTreeMap<String, TaskUid>,
     pub(crate) live: BTreeMap<TaskUid, Live>,
     pub(crate) over: BTreeMap<TaskUid, Over>,
+    /// Which framework's id launched a task, as its agent was told: it may be over before anybody looks at the store.
+    pub(crate) launched: BTreeMap<TaskUid, String>,
     /// Live attempts that were ordered to end, until somebody has looked why.
     pub(crate) ordered: Vec<(u64, TaskUid)>,
 }

@@ -394,7 +394,9 @@ impl World {
     /// What was told to end was told so by somebody, and the store knows it.
     fn nobody_was_ended_for_nothing(&mut self) -> Result<(), Violation> {
         for (at, uid) in std::mem::take(&mut self.truth.ordered) {
-            let asked = self.users.may_end.contains(&uid);
+            let launched = self.truth.launched.get(&uid);
+            let lost = |id: &String| self.frameworks.iter().any(|f| f.may_lose(id, self.now));
+            let asked = self.users.may_end.contains(&uid) || launched.is_some_and(lost);
             let status = self.view.task(&uid).and_then(|task| task.status.as_ref());
             let ordered = status.is_some_and(|s| s.stop.is_some());
             if !asked && !ordered {

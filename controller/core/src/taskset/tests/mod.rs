@@ -324,7 +324,7 @@ fn a_first_rollout_counts_although_a_task_crashed_once() {
     let mut world = World::new(json!({"replicas": 1}), 2);
     world.steps(3);
     let task = world.task("set-0");
-    (task.attempt, task.exited) = (2, true);
+    (task.attempt, task.exited) = (2, Some("exited with code 1".to_owned()));
     world.settle();
     assert_eq!(world.progressing().0, "Complete");
     assert_eq!(world.status.current_revision, world.status.update_revision);

@@ -190,7 +190,7 @@ impl World {
                 TaskPhase::Running if bad(task) => {
                     task.phase = TaskPhase::Starting;
                     task.attempt += 1;
-                    task.exited = true;
+                    task.exited = Some("exited with code 1".to_owned());
                     "BackOff".clone_into(&mut task.reason);
                     "exited with code 1".clone_into(&mut task.message);
                 }
@@ -455,7 +455,7 @@ impl World {
             started: None,
             finished: None,
             attempt: 0,
-            exited: false,
+            exited: None,
             ready: None,
             ready_since: None,
             ending: false,

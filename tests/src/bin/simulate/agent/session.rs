@@ -283,6 +283,12 @@ impl Agent {
     fn assign(&mut self, message: proto::Assignments, hands: &mut Hands<'_>) {
         let context = self.context(hands);
         let Some(life) = &mut self.life else { return };
+        for upsert in &message.upserts {
+            if let Some(framework) = &upsert.framework {
+                let uid = TaskUid::new(upsert.uid.as_str());
+                hands.truth.launched.insert(uid, framework.id.clone());
+            }
+        }
         let keep = |wire: &proto::Assignment, spec| Agent::kept(&wire.name, &spec);
         let (assignments, mut kept) = decode(message, |uid| life.tasks.contains_key(uid), keep);
         let known = life.tasks.iter().map(|(uid, cell)| (uid.clone(), cell.forgotten)).collect();
