@@ -38,14 +38,12 @@ fn frames_of_tasks_and_executors_are_read_or_end_the_connection() {
     let open = of_sensor::Call { call: Some(of_sensor::call::Call::Open(open)) };
     let seeds = [framed(&said), framed(&drive), framed(&open)];
     let seeds = seeds.iter().map(|seed| seed.repeat(2)).chain(seeds.clone());
-    bolero::check!()
-        .with_generator(muster_hostile::inputs("headers").and(seeds))
-        .with_test_time(muster_hostile::test_time())
-        .for_each(|bytes: &Vec<u8>| {
-            read_all::<of_executor::Call>(bytes);
-            read_all::<of_gate::Call>(bytes);
-            read_all::<of_sensor::Call>(bytes);
-        });
+    let inputs = muster_hostile::inputs("headers").and(seeds);
+    muster_hostile::feed(bolero::check!(), inputs, |bytes| {
+        read_all::<of_executor::Call>(bytes);
+        read_all::<of_gate::Call>(bytes);
+        read_all::<of_sensor::Call>(bytes);
+    });
 }
 
 #[test]
@@ -56,13 +54,11 @@ fn worlds_are_read_or_refused() {
     std::fs::copy(format!("{lab}/lab.pgm"), dir.path().join("lab.pgm")).expect("it is there");
     let path = dir.path().join("world.yaml");
     let world = std::fs::read(format!("{lab}/world.yaml")).expect("it is there");
-    bolero::check!()
-        .with_generator(muster_hostile::inputs("agent").and([world]))
-        .with_test_time(muster_hostile::test_time())
-        .for_each(|bytes: &Vec<u8>| {
-            std::fs::write(&path, bytes).expect("it is ours");
-            if let Err(error) = Settings::read(&path) {
-                assert!(!error.to_string().is_empty());
-            }
-        });
+    let inputs = muster_hostile::inputs("agent").and([world]);
+    muster_hostile::feed(bolero::check!(), inputs, |bytes| {
+        std::fs::write(&path, bytes).expect("it is ours");
+        if let Err(error) = Settings::read(&path) {
+            assert!(!error.to_string().is_empty());
+        }
+    });
 }

@@ -41,6 +41,9 @@ const PLASTER: [u8; 3] = [190, 184, 172];
 /// Pixels of a camera at most: three bytes each.
 const MOST_PIXELS: u64 = 4_000_000;
 
+/// Metres from the middle of a world to its end.
+const FARTHEST: f64 = 1e6;
+
 /// `world.yaml`.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "camelCase", deny_unknown_fields, default)]
@@ -251,6 +254,12 @@ impl Settings {
             return wrong(field, format!("{value} is not a number above 0"));
         }
         for (number, wall) in self.walls.iter().enumerate() {
+            let far = |at: &&f64| at.abs() > FARTHEST;
+            if let Some(at) = wall.line.iter().flatten().find(far) {
+                let reason =
+                    format!("{at} is farther than {FARTHEST} m from the middle of the world");
+                return wrong(&format!("walls[{number}].line"), reason);
+            }
             let same = |pair: &[[f64; 2]]| pair[0] == pair[1];
             let finite = wall.line.iter().flatten().all(|at| at.is_finite());
             if wall.line.len() < 2 || !finite || wall.line.windows(2).any(same) {

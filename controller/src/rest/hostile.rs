@@ -24,22 +24,20 @@ fn patches_are_applied_or_refused() {
             "ownerReferences": [{"uid": "u", "kind": "TaskSet"}]},
         "spec": {"priority": 1, "run": {"process": {"command": ["true"], "args": ["x"]}}},
     });
-    bolero::check!()
-        .with_generator(muster_hostile::inputs("patches"))
-        .with_test_time(muster_hostile::test_time())
-        .for_each(|bytes: &Vec<u8>| {
-            let bytes = Bytes::copy_from_slice(bytes);
-            for media in [patch::MERGE, patch::STRATEGIC, patch::JSON] {
-                let applied =
-                    patch::read(media, &bytes).and_then(|patch| patch::apply(&patch, &present));
-                match applied {
-                    // A merge is as deep as the patch, which was read; operations could go on for ever.
-                    Ok(object) if media == patch::JSON => assert!(!is_deeper(&object, DEEPEST)),
-                    Ok(object) => drop(object.to_string()),
-                    Err(failure) => blames_the_client(&failure),
-                }
+    let inputs = muster_hostile::inputs("patches");
+    muster_hostile::feed(bolero::check!(), inputs, |bytes| {
+        let bytes = Bytes::copy_from_slice(bytes);
+        for media in [patch::MERGE, patch::STRATEGIC, patch::JSON] {
+            let applied =
+                patch::read(media, &bytes).and_then(|patch| patch::apply(&patch, &present));
+            match applied {
+                // A merge is as deep as the patch, which was read; operations could go on for ever.
+                Ok(object) if media == patch::JSON => assert!(!is_deeper(&object, DEEPEST)),
+                Ok(object) => drop(object.to_string()),
+                Err(failure) => blames_the_client(&failure),
             }
-        });
+        }
+    });
 }
 
 /// A field of protobuf's that holds bytes.
@@ -71,43 +69,38 @@ fn objects_in_protobuf_are_read_or_refused() {
         object("Eviction", &metadata),
         object("SelfSubjectAccessReview", &field(2, &field(1, &field(2, b"get")))),
     ];
-    bolero::check!()
-        .with_generator(muster_hostile::inputs("headers").and(seeds))
-        .with_test_time(muster_hostile::test_time())
-        .for_each(|bytes: &Vec<u8>| match protobuf::json(bytes) {
-            Ok(object) => assert_eq!(body::parse(object.to_string().as_bytes()).unwrap(), object),
-            Err(failure) => blames_the_client(&failure),
-        });
+    let inputs = muster_hostile::inputs("headers").and(seeds);
+    muster_hostile::feed(bolero::check!(), inputs, |bytes| match protobuf::json(bytes) {
+        Ok(object) => assert_eq!(body::parse(object.to_string().as_bytes()).unwrap(), object),
+        Err(failure) => blames_the_client(&failure),
+    });
 }
 
 #[test]
 fn queries_are_understood_or_refused() {
-    bolero::check!()
-        .with_generator(muster_hostile::inputs("patches"))
-        .with_test_time(muster_hostile::test_time())
-        .for_each(|bytes: &Vec<u8>| {
-            let Ok(uri) = format!("/x?{}", String::from_utf8_lossy(bytes)).parse::<Uri>() else {
-                return;
-            };
-            let query = match Query::read(&uri) {
-                Ok(query) => query,
-                Err(failure) => return blames_the_client(&failure),
-            };
-            let refused = [
-                query.lasts().map(drop),
-                query.dry_run().map(drop),
-                query.field_validation().map(drop),
-                query.revision().map(drop),
-                query.parse::<usize>("limit").map(drop),
-            ];
-            let entries =
-                [TASKS, NODES].map(|resource| registry::of(resource).expect("it is served"));
-            let selections =
-                entries.map(|entry| Selection::read(entry, Some("default"), &query).map(drop));
-            refused
-                .iter()
-                .chain(&selections)
-                .filter_map(|read| read.as_ref().err())
-                .for_each(blames_the_client);
-        });
+    let inputs = muster_hostile::inputs("patches");
+    muster_hostile::feed(bolero::check!(), inputs, |bytes| {
+        let Ok(uri) = format!("/x?{}", String::from_utf8_lossy(bytes)).parse::<Uri>() else {
+            return;
+        };
+        let query = match Query::read(&uri) {
+            Ok(query) => query,
+            Err(failure) => return blames_the_client(&failure),
+        };
+        let refused = [
+            query.lasts().map(drop),
+            query.dry_run().map(drop),
+            query.field_validation().map(drop),
+            query.revision().map(drop),
+            query.parse::<usize>("limit").map(drop),
+        ];
+        let entries = [TASKS, NODES].map(|resource| registry::of(resource).expect("it is served"));
+        let selections =
+            entries.map(|entry| Selection::read(entry, Some("default"), &query).map(drop));
+        refused
+            .iter()
+            .chain(&selections)
+            .filter_map(|read| read.as_ref().err())
+            .for_each(blames_the_client);
+    });
 }

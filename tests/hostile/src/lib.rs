@@ -10,7 +10,7 @@
 //! ```
 //!
 //! Its seeds are the files of `seeds/NAME`, and those that it names beside. `cargo test` gives each the same inputs every
-//! time: a change that fails is what made it fail. With [`SECONDS`] bolero's engine makes others for so long. What makes a
+//! time: what fails then fails because of a change. With [`SECONDS`] bolero's engine makes others for so long. What makes a
 //! target fail is shrunk and printed: it belongs among the seeds then. The same targets run under bolero's other engines,
 //! which are guided by coverage: `MUSTER_HOSTILE_SECONDS=0 cargo bolero test -e libfuzzer …`.
 

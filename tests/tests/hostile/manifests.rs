@@ -11,10 +11,7 @@ fn manifests(dir: &str) -> PathBuf {
 fn manifests_are_read_or_refused_at_a_place() {
     let inputs = muster_hostile::inputs("manifests").and_those_in(&manifests("examples"));
     let inputs = inputs.and_those_in(&manifests("invalid")).and_those_in(&manifests("lab"));
-    bolero::check!()
-        .with_generator(inputs)
-        .with_test_time(muster_hostile::test_time())
-        .for_each(|bytes: &Vec<u8>| check(&String::from_utf8_lossy(bytes)));
+    muster_hostile::feed(bolero::check!(), inputs, |bytes| check(&String::from_utf8_lossy(bytes)));
 }
 
 fn check(text: &str) {

@@ -7,23 +7,20 @@ use muster_ros1::{nav_msgs, sensor_msgs, tf2_msgs};
 
 #[test]
 fn calls_and_answers_are_read_as_they_are_written() {
-    bolero::check!()
-        .with_generator(muster_hostile::inputs("xmlrpc"))
-        .with_test_time(muster_hostile::test_time())
-        .for_each(|bytes: &Vec<u8>| {
-            let text = String::from_utf8_lossy(bytes);
-            // Written once, there is nothing in it any more that XML has no way to write.
-            let call =
-                |text: &str| xmlrpc::call(text).map(|c| xmlrpc::write_call(&c.method, &c.params));
-            if let Ok(once) = call(&text) {
-                assert_eq!(call(&once), Ok(once));
-            }
-            let answer =
-                |text: &str| xmlrpc::answer(text).map(|answer| xmlrpc::write_answer(&answer));
-            if let Ok(once) = answer(&text) {
-                assert_eq!(answer(&once), Ok(once));
-            }
-        });
+    let inputs = muster_hostile::inputs("xmlrpc");
+    muster_hostile::feed(bolero::check!(), inputs, |bytes| {
+        let text = String::from_utf8_lossy(bytes);
+        // Written once, there is nothing in it any more that XML has no way to write.
+        let call =
+            |text: &str| xmlrpc::call(text).map(|c| xmlrpc::write_call(&c.method, &c.params));
+        if let Ok(once) = call(&text) {
+            assert_eq!(call(&once), Ok(once));
+        }
+        let answer = |text: &str| xmlrpc::answer(text).map(|answer| xmlrpc::write_answer(&answer));
+        if let Ok(once) = answer(&text) {
+            assert_eq!(answer(&once), Ok(once));
+        }
+    });
 }
 
 #[test]
@@ -34,15 +31,13 @@ fn connection_headers_are_read_as_they_are_written() {
         ("md5sum", "*"),
         ("type", "*"),
     ]);
-    bolero::check!()
-        .with_generator(muster_hostile::inputs("headers").and([subscriber.encode()[4..].to_vec()]))
-        .with_test_time(muster_hostile::test_time())
-        .for_each(|bytes: &Vec<u8>| {
-            let Ok(header) = Header::decode(bytes) else { return };
-            let again = Header::decode(&header.encode()[4..]).expect("it is a header");
-            assert_eq!(format!("{again:?}"), format!("{header:?}"));
-            assert_eq!(again.get("topic"), header.get("topic"));
-        });
+    let inputs = muster_hostile::inputs("headers").and([subscriber.encode()[4..].to_vec()]);
+    muster_hostile::feed(bolero::check!(), inputs, |bytes| {
+        let Ok(header) = Header::decode(bytes) else { return };
+        let again = Header::decode(&header.encode()[4..]).expect("it is a header");
+        assert_eq!(format!("{again:?}"), format!("{header:?}"));
+        assert_eq!(again.get("topic"), header.get("topic"));
+    });
 }
 
 /// What decodes is encoded so that it decodes the same.
@@ -65,14 +60,12 @@ fn messages_are_decoded_as_they_are_encoded() {
     let mut moved = tf2_msgs::TFMessage::nothing();
     moved.transforms = vec![Wire::nothing()];
     let seeds = [scan.encode(), image.encode(), odometry.encode(), moved.encode()];
-    bolero::check!()
-        .with_generator(muster_hostile::inputs("headers").and(seeds))
-        .with_test_time(muster_hostile::test_time())
-        .for_each(|bytes: &Vec<u8>| {
-            let bytes = Bytes::copy_from_slice(bytes);
-            there_and_back::<sensor_msgs::LaserScan>(&bytes);
-            there_and_back::<sensor_msgs::Image>(&bytes);
-            there_and_back::<nav_msgs::Odometry>(&bytes);
-            there_and_back::<tf2_msgs::TFMessage>(&bytes);
-        });
+    let inputs = muster_hostile::inputs("headers").and(seeds);
+    muster_hostile::feed(bolero::check!(), inputs, |bytes| {
+        let bytes = Bytes::copy_from_slice(bytes);
+        there_and_back::<sensor_msgs::LaserScan>(&bytes);
+        there_and_back::<sensor_msgs::Image>(&bytes);
+        there_and_back::<nav_msgs::Odometry>(&bytes);
+        there_and_back::<tf2_msgs::TFMessage>(&bytes);
+    });
 }

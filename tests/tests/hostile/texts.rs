@@ -21,55 +21,51 @@ where
 
 #[test]
 fn quantities_are_read_as_they_are_printed() {
-    bolero::check!()
-        .with_generator(muster_hostile::inputs("quantities"))
-        .with_test_time(muster_hostile::test_time())
-        .for_each(|bytes: &Vec<u8>| {
-            let text = String::from_utf8_lossy(bytes);
-            there_and_back::<MilliCpu>(&text);
-            there_and_back::<Bytes>(&text);
-            there_and_back::<BitRate>(&text);
-        });
+    let inputs = muster_hostile::inputs("quantities");
+    muster_hostile::feed(bolero::check!(), inputs, |bytes| {
+        let text = String::from_utf8_lossy(bytes);
+        there_and_back::<MilliCpu>(&text);
+        there_and_back::<Bytes>(&text);
+        there_and_back::<BitRate>(&text);
+    });
 }
 
 #[test]
 fn selectors_select_or_are_refused() {
     let object = json!({"metadata": {"name": "tb-1", "labels": {"floor": "2"}}, "status": {"phase": "Running"}});
     let labels = [("floor".to_owned(), "2".to_owned())].into();
-    bolero::check!()
-        .with_generator(muster_hostile::inputs("selectors"))
-        .with_test_time(muster_hostile::test_time())
-        .for_each(|bytes: &Vec<u8>| {
-            let text = String::from_utf8_lossy(bytes);
-            match LabelSelector::parse(&text) {
-                Ok(selector) => {
-                    let selects = selector.matches(&labels);
-                    let again = serde_json::to_value(&selector).unwrap();
-                    let again: LabelSelector = serde_json::from_value(again).unwrap();
-                    assert_eq!(again.matches(&labels), selects, "{text:?}");
-                }
-                Err(error) => assert!(!error.to_string().is_empty()),
+    let inputs = muster_hostile::inputs("selectors");
+    muster_hostile::feed(bolero::check!(), inputs, |bytes| {
+        let text = String::from_utf8_lossy(bytes);
+        match LabelSelector::parse(&text) {
+            Ok(selector) => {
+                let selects = selector.matches(&labels);
+                let again = serde_json::to_value(&selector).unwrap();
+                let again: LabelSelector = serde_json::from_value(again).unwrap();
+                assert_eq!(again.matches(&labels), selects, "{text:?}");
             }
-            if let Ok(selector) = FieldSelector::parse(&text) {
-                drop(format!("{}", selector.matches(&object)));
-            }
-        });
+            Err(error) => assert!(!error.to_string().is_empty()),
+        }
+        if let Ok(selector) = FieldSelector::parse(&text) {
+            drop(format!("{}", selector.matches(&object)));
+        }
+    });
 }
 
 #[test]
 fn maps_have_the_cells_that_they_say() {
-    bolero::check!()
-        .with_generator(muster_hostile::inputs("maps"))
-        .with_test_time(muster_hostile::test_time())
-        .for_each(|bytes: &Vec<u8>| {
-            let settings = MapFile::parse(&String::from_utf8_lossy(bytes));
-            let usual = || {
-                MapFile::parse("image: a.pgm\nresolution: 0.05\norigin: [0, 0, 0]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n")
-            };
-            let settings = settings.or_else(|_| usual()).expect("it is a map");
-            let Ok(image) = Gray::pgm(bytes) else { return };
-            let grid = settings.grid(&image);
-            assert_eq!(grid.cells.len() as u64, u64::from(grid.width) * u64::from(grid.height));
-            assert_eq!(grid.at(f64::MAX, f64::MIN), None);
-        });
+    let inputs = muster_hostile::inputs("maps");
+    muster_hostile::feed(bolero::check!(), inputs, |bytes| {
+        let settings = MapFile::parse(&String::from_utf8_lossy(bytes));
+        let usual = || {
+            MapFile::parse(
+                "image: a.pgm\nresolution: 0.05\norigin: [0, 0, 0]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n",
+            )
+        };
+        let settings = settings.or_else(|_| usual()).expect("it is a map");
+        let Ok(image) = Gray::pgm(bytes) else { return };
+        let grid = settings.grid(&image);
+        assert_eq!(grid.cells.len() as u64, u64::from(grid.width) * u64::from(grid.height));
+        assert_eq!(grid.at(f64::MAX, f64::MIN), None);
+    });
 }

@@ -58,14 +58,14 @@ fn kubectl() -> u64 {
 
 /// The command changes nothing, and ends by itself: the same one later is the same question.
 fn only_looks(command: &str) -> bool {
-    let verb = |rest: &str| {
-        let rest = rest.strip_prefix("-n lab ").unwrap_or(rest);
-        LOOKS.iter().any(|verb| rest.split(' ').next() == Some(verb))
+    let looks = |call: &str| {
+        let call = call.strip_prefix("-n lab ").unwrap_or(call);
+        LOOKS.contains(&call.split(' ').next().unwrap_or_default())
     };
-    // What is piped into another kubectl is looked at as well.
+    // Every kubectl of a pipe counts.
     let mut calls = command.split("kubectl ").skip(1).peekable();
     let follows = command.contains(" -w") || command.contains("timeout ");
-    calls.peek().is_some() && calls.all(verb) && !follows
+    calls.peek().is_some() && calls.all(looks) && !follows
 }
 
 fn run(command: &str, dir: &Path, cluster: &Cluster) -> (bool, String) {

@@ -12,6 +12,9 @@ pub const TOUCH: f64 = 1e-9;
 /// The grid has at most so many cells; a larger world has larger ones.
 const MOST_CELLS: f64 = 1_000_000.0;
 
+/// Cells along one side at most, so that a long wall is in some thousand.
+const MOST_ALONG: f64 = 4_096.0;
+
 /// Cells are at least so large, metres: a robot's width, and a ray crosses two a metre.
 const LEAST_CELL: f64 = 0.5;
 
@@ -157,7 +160,8 @@ impl Grid {
         };
         let least = Point2::new(edge(0, f64::min), edge(1, f64::min));
         let size = Point2::new(edge(0, f64::max), edge(1, f64::max)) - least;
-        let cell = (size.x.max(1.0) * size.y.max(1.0) / MOST_CELLS).sqrt().max(LEAST_CELL);
+        let even = (size.x.max(1.0) * size.y.max(1.0) / MOST_CELLS).sqrt();
+        let cell = even.max(size.max() / MOST_ALONG).max(LEAST_CELL);
         // Walls along the rim are inside of it.
         let origin = least - Vector2::repeat(cell / 2.0);
         let count = |length: f64| index(((length + cell) / cell).floor()) + 1;
@@ -171,10 +175,13 @@ impl Grid {
         let mut pairs: Vec<(usize, u32)> = Vec::new();
         let reach = self.cell * std::f64::consts::FRAC_1_SQRT_2 + TOUCH;
         for (number, wall) in (0_u32..).zip(walls) {
-            for (cell, middle) in self.cells_of(wall.from, wall.to, 0.0) {
-                // What passes a cell is no farther from its middle than its corners are.
-                if to_line(middle, (wall.from, wall.to)) <= reach {
-                    pairs.push((cell, number));
+            // Row by row, each with that part of the wall which can be near it: a wall across is not in every cell around it.
+            for (from, to) in self.by_rows(wall, reach) {
+                for (cell, middle) in self.cells_of(from, to, 0.0) {
+                    // What passes a cell is no farther from its middle than its corners are.
+                    if to_line(middle, (wall.from, wall.to)) <= reach {
+                        pairs.push((cell, number));
+                    }
                 }
             }
         }
@@ -188,6 +195,26 @@ impl Grid {
         }
         self.starts = starts;
         self.walls = pairs.into_iter().map(|(_, wall)| wall).collect();
+    }
+
+    /// A box for each row of cells that a wall passes, by two of its corners: of the row's height, and as wide as what of the
+    /// wall is within `reach` of the row.
+    fn by_rows(&self, wall: &Wall, reach: f64) -> impl Iterator<Item = Line> + use<> {
+        let (origin, cell, count) = (self.origin, self.cell, self.rows);
+        let (from, side) = (wall.from, wall.to - wall.from);
+        let row = |y: f64| index(((y - origin.y) / cell).floor()).min(count - 1);
+        let (low, high) = (wall.from.y.min(wall.to.y), wall.from.y.max(wall.to.y));
+        (row(low)..row(high) + 1).map(move |row| {
+            let (bottom, top) =
+                (origin.y + count_of(row) * cell, origin.y + count_of(row + 1) * cell);
+            let at = |y: f64, level: f64| {
+                if side.y == 0.0 { level } else { ((y - from.y) / side.y).clamp(0.0, 1.0) }
+            };
+            let x = [at(bottom - reach, 0.0), at(top + reach, 1.0)].map(|at| from.x + side.x * at);
+            let middle = f64::midpoint(bottom, top);
+            let corner = |x: f64| Point2::new(x, middle);
+            (corner(x[0].min(x[1]) - reach), corner(x[0].max(x[1]) + reach))
+        })
     }
 
     /// The cells around a line, each with its middle.
@@ -318,6 +345,28 @@ pub(super) mod tests {
         let at = || (-40..40_i32).prop_map(|half| f64::from(half) / 2.0);
         let one = (at(), at(), at(), at()).prop_map(|(a, b, c, d)| wall(a, b, c, d));
         proptest::collection::vec(one.prop_filter("a point is none", |w| w.from != w.to), 0..12)
+    }
+
+    #[test]
+    fn large_worlds_have_bounded_grids() {
+        let far = 1e6;
+        for walls in [
+            vec![wall(-far, 0.0, far, 1.0)],
+            vec![wall(-far, -far, far, far), wall(-far, far, far, -far)],
+            vec![wall(0.0, -far, 0.0, far), wall(0.0, 0.0, 1e-3, 0.0)],
+        ] {
+            let world = World::new(walls.clone());
+            let grid = &world.grid;
+            assert!(count_of(grid.columns.max(grid.rows)) <= MOST_ALONG + 2.0, "{}", grid.columns);
+            // A line passes no more cells than columns and rows together, and touches as many.
+            assert!(grid.walls.len() <= 4 * (grid.columns + grid.rows), "{}", grid.walls.len());
+            let hit = world.cast(Point2::new(-2.0, -1.0), FRAC_PI_2, far).map(|hit| hit.wall);
+            let nearest = walls.iter().enumerate().filter_map(|(number, wall)| {
+                let up = Vector2::new(0.0, 1.0);
+                meets(wall, Point2::new(-2.0, -1.0), up).map(|at| (at, number))
+            });
+            assert_eq!(hit, nearest.min_by(|a, b| a.0.total_cmp(&b.0)).map(|(_, number)| number));
+        }
     }
 
     #[test]

@@ -354,14 +354,12 @@ current-context: x
     fn hostile_files_are_targets_or_errors() {
         let dir = tempfile::tempdir().expect("a directory");
         let file = [dir.path().join("config")];
-        bolero::check!()
-            .with_generator(muster_hostile::inputs("kubeconfig"))
-            .with_test_time(muster_hostile::test_time())
-            .for_each(|bytes: &Vec<u8>| {
-                std::fs::write(&file[0], bytes).expect("it is ours");
-                if let Err(error) = load(&file) {
-                    assert!(!error.to_string().is_empty());
-                }
-            });
+        let inputs = muster_hostile::inputs("kubeconfig");
+        muster_hostile::feed(bolero::check!(), inputs, |bytes| {
+            std::fs::write(&file[0], bytes).expect("it is ours");
+            if let Err(error) = load(&file) {
+                assert!(!error.to_string().is_empty());
+            }
+        });
     }
 }

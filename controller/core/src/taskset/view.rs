@@ -105,8 +105,8 @@ impl TaskView {
             finished: status.finished_at.map(|t| t.0),
             attempt: status.attempt,
             exited: match (status.exit_code, status.signal) {
-                (Some(code), _) => Some(format!("exited with code {code}")),
-                (None, Some(signal)) => Some(format!("ended by signal {signal}")),
+                (_, Some(signal)) => Some(format!("ended by signal {signal}")),
+                (Some(code), None) => Some(format!("exited with code {code}")),
                 (None, None) => None,
             },
             ready: status.ready,
