@@ -4,6 +4,7 @@
 //! |---|---|---|
 //! | main loop | supervisor | on shutdown |
 //! | link | session, the node's face | dropped on shutdown |
+//! | renewal | the certificate | dropped on shutdown |
 //! | images | pulls before tasks need them | dropped on shutdown |
 //! | topics | ROS nodes that count for probes | dropped on shutdown |
 //! | simulator | the robot that is not there, and where it is | dropped on shutdown; its process stays |
@@ -42,6 +43,7 @@ use crate::images::Images;
 use crate::link::dial::Dialer;
 use crate::link::join::{self, Credentials, JoinError};
 use crate::link::orders::Orders;
+use crate::link::renewal::Renewal;
 use crate::link::session::{Command, Link};
 use crate::link::token::{Token, TokenError};
 use crate::link::{Address, AddressError};
@@ -308,8 +310,14 @@ pub async fn serve(
             "this node's certificate is an older one: its messages pass the controller; a new token brings a new one"
         );
     }
-    let door = Door::new(config.messages.clone(), serving, Arc::clone(&shared.desks));
-    let dialer = Dialer { address, tls: Arc::new(credentials.tls()?) };
+    let serving = serving.map(|config| watch::Sender::new(Arc::new(config)));
+    let shown = serving.as_ref().map(watch::Sender::subscribe);
+    let door = Door::new(config.messages.clone(), shown, Arc::clone(&shared.desks));
+    let client = watch::Sender::new(Arc::new(credentials.tls()?));
+    let dialer = Dialer { address: address.clone(), tls: client.subscribe() };
+    let renewal =
+        Renewal { address, node: shared.node.clone(), kind, credentials, client, server: serving };
+    let _renewal = AbortOnDropHandle::new(tokio::spawn(renewal.run()));
     let orders = keeper.clone().map(|gate| Orders {
         dialer: dialer.clone(),
         gate,

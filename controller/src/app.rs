@@ -20,8 +20,9 @@ use axum::Router;
 use axum::middleware::from_fn_with_state;
 use axum::response::{IntoResponse as _, Response};
 use futures::FutureExt as _;
+use rustls::ServerConfig;
 use tokio::net::TcpListener;
-use tokio::sync::mpsc;
+use tokio::sync::{mpsc, watch};
 use tokio::task::{JoinError, JoinHandle};
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
@@ -31,7 +32,7 @@ use crate::config::Config;
 use crate::context::{Clock as _, Context, Live, SystemClock};
 use crate::events::{self, Happening, Recorder};
 use crate::kubeconfig::KubeconfigError;
-use crate::pki::{Pki, PkiError};
+use crate::pki::{Pem, Pki, PkiError};
 use crate::rest::failure::Failure;
 use crate::serve::Server;
 use crate::session::agents::Agents;
@@ -49,6 +50,8 @@ use crate::{auth, footprint, kubeconfig, metrics, reconcile, rest};
 
 /// How long requests in flight may take to finish after a signal.
 const DEADLINE: Duration = Duration::from_secs(5);
+/// Between two looks at the controller's own certificates, at most.
+const LOOK_AT_CERTIFICATES: Duration = Duration::from_secs(3600);
 
 /// Why the controller did not start.
 #[derive(Debug, thiserror::Error)]
@@ -137,8 +140,10 @@ pub async fn run(
 pub async fn start(config: Config) -> Result<Running, AppError> {
     let now = SystemClock.now();
     let lock = lock(&config.data_dir)?;
-    let pki = Pki::open(&config.data_dir.join("pki"), now)?;
-    let tls = Arc::new(pki.server_config(&names(&config), now)?);
+    let pki = Pki::open(&config.data_dir.join("pki"), now)?.with_ttl(config.certificate_ttl);
+    let names = names(&config);
+    let server = pki.server(&names, now)?;
+    let tls = watch::Sender::new(Arc::new(pki.server_config(&server)?));
     let metrics = metrics::recorder()?;
     let in_data_dir = || config.data_dir.join(store::sqlite::KEY_FILE);
     let keys = config.encryption_key.clone().unwrap_or_else(in_data_dir);
@@ -159,9 +164,12 @@ pub async fn start(config: Config) -> Result<Running, AppError> {
     kubeconfig::write(file, asked, &context.url(), context.pki.ca(), &admin)?;
 
     let background = TaskTracker::new();
+    let shown = tls.subscribe();
+    let renewal = Renewal { context: Arc::clone(&context), names, server, admin, tls };
+    background.spawn(guard(Arc::clone(&context), "certificates", renewal.run()));
     let services = work(&context, &background, happenings);
     let server = Server {
-        tls,
+        tls: shown,
         router: router(&context, services),
         stop: context.stop.clone(),
         kill: CancellationToken::new(),
@@ -342,6 +350,51 @@ fn names(config: &Config) -> BTreeSet<String> {
     names
 }
 
+/// What of the controller's own certificates is in use.
+struct Renewal {
+    context: Arc<Context>,
+    names: BTreeSet<String>,
+    server: Pem,
+    admin: Pem,
+    /// For connections that come from now on.
+    tls: watch::Sender<Arc<ServerConfig>>,
+}
+
+impl Renewal {
+    /// Looks now and then whether a certificate nears its end, until `context.stop`. Machines sleep, and clocks are set: the
+    /// time is asked each time.
+    async fn run(mut self) {
+        let stop = self.context.stop.clone();
+        let pause = (self.context.config.certificate_ttl / 60).min(LOOK_AT_CERTIFICATES);
+        while stop.run_until_cancelled(tokio::time::sleep(pause)).await.is_some() {
+            if let Err(error) = self.look() {
+                tracing::error!(
+                    error = chain(&error),
+                    "the controller's certificates cannot be renewed"
+                );
+            }
+        }
+    }
+
+    fn look(&mut self) -> Result<(), AppError> {
+        let (context, now) = (&self.context, self.context.clock.now());
+        let server = context.pki.server(&self.names, now)?;
+        if server.certificate != self.server.certificate {
+            self.tls.send_replace(Arc::new(context.pki.server_config(&server)?));
+            tracing::info!("the server's certificate is renewed");
+            self.server = server;
+        }
+        let admin = context.pki.admin(now)?;
+        if admin.certificate != self.admin.certificate {
+            let (file, asked) = (&context.config.kubeconfig, context.config.kubeconfig_asked);
+            kubeconfig::write(file, asked, &context.url(), context.pki.ca(), &admin)?;
+            tracing::info!(file = %file.display(), "the administrator's certificate is renewed");
+            self.admin = admin;
+        }
+        Ok(())
+    }
+}
+
 /// Ready at SIGINT or SIGTERM.
 pub async fn signal() {
     use tokio::signal::unix::{SignalKind, signal};
@@ -380,6 +433,7 @@ mod tests {
             kubeconfig_asked: true,
             advertise: Vec::new(),
             encryption_key: None,
+            certificate_ttl: crate::pki::TTL,
         }
     }
 

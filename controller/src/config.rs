@@ -2,6 +2,12 @@
 
 use std::net::SocketAddr;
 use std::path::PathBuf;
+use std::time::Duration;
+
+use muster_api::duration::Span;
+
+/// A certificate that counts for less could end before its holder has seen that it is to be renewed.
+const SHORTEST_TTL: Duration = Duration::from_secs(60);
 
 /// The flags of `muster-controller` and of `muster controller`.
 #[derive(Debug, Clone, clap::Args)]
@@ -23,6 +29,9 @@ pub struct Args {
     /// nothing was sealed yet [default: encryption.key in the data directory]
     #[arg(long, value_name = "FILE")]
     pub encryption_key: Option<PathBuf>,
+    /// How long a certificate counts that this controller signs; all are renewed by themselves in time
+    #[arg(long, value_name = "DURATION", default_value = "8760h", value_parser = certificate_ttl)]
+    pub certificate_ttl: Span,
 }
 
 /// What the controller needs to know to run.
@@ -40,6 +49,18 @@ pub struct Config {
     pub advertise: Vec<String>,
     /// The keys of the Secrets; none: beside the store.
     pub encryption_key: Option<PathBuf>,
+    /// How long a certificate counts; [`pki::TTL`](crate::pki::TTL) where nobody says otherwise.
+    pub certificate_ttl: Duration,
+}
+
+fn certificate_ttl(text: &str) -> Result<Span, String> {
+    let ttl: Span = text
+        .parse()
+        .map_err(|error| format!("{error}; write a time with its unit, as in 8760h"))?;
+    match ttl.as_duration() < SHORTEST_TTL {
+        true => Err(format!("a certificate counts for {} s at least", SHORTEST_TTL.as_secs())),
+        false => Ok(ttl),
+    }
 }
 
 impl From<Args> for Config {
@@ -53,6 +74,7 @@ impl From<Args> for Config {
             kubeconfig: args.kubeconfig.unwrap_or_else(|| own.join("config")),
             advertise: args.advertise,
             encryption_key: args.encryption_key,
+            certificate_ttl: args.certificate_ttl.as_duration(),
         }
     }
 }

@@ -185,6 +185,7 @@ pub(crate) fn for_tests(dir: &std::path::Path, store: Store) -> Arc<Context> {
         kubeconfig_asked: true,
         advertise: Vec::new(),
         encryption_key: None,
+        certificate_ttl: crate::pki::TTL,
     };
     let (address, (events, _)) = (config.listen, Recorder::new());
     let metrics = crate::metrics::recorder().expect("the process's recorder");

@@ -2,7 +2,7 @@
 //!
 //! ```text
 //! DIR/pki/ca.crt ca.key          ten years; its SHA-256 is part of every join token
-//! DIR/pki/server.crt server.key  presented as leaf + CA; made anew when names change or it nears its end
+//! DIR/pki/server.crt server.key  presented as leaf + CA; made anew when names change or it nears its end, also while the controller runs
 //! DIR/pki/admin.crt admin.key    O=muster:admins, what the kubeconfig holds
 //! ```
 //! A key is written before its certificate, and only a certificate makes a pair count, so a crash in between leaves
@@ -15,8 +15,9 @@ use std::net::IpAddr;
 use std::os::unix::fs::{DirBuilderExt as _, OpenOptionsExt as _};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::time::Duration;
 
-use jiff::{Span, Timestamp, tz::TimeZone};
+use jiff::Timestamp;
 use muster_api::direct::server_name;
 use rcgen::{
     BasicConstraints, CertificateParams, CertificateSigningRequestParams, DistinguishedName,
@@ -36,9 +37,10 @@ pub const NODES: &str = "muster:nodes";
 pub const NODE_PREFIX: &str = "muster:node:";
 
 const CA_DAYS: i64 = 3650;
-const LEAF_DAYS: i64 = 365;
-/// A certificate that ends sooner than this is made anew at start.
-const RENEW_DAYS: i64 = 30;
+/// How long a certificate counts that is not the CA's.
+pub const TTL: Duration = Duration::from_secs(365 * 24 * 3600);
+/// How long before its making a certificate counts at most: the clock of a joining agent may be a little behind.
+const BEFORE: Duration = Duration::from_secs(24 * 3600);
 
 /// Why certificates could not be made or read.
 #[derive(Debug, thiserror::Error)]
@@ -82,6 +84,7 @@ pub struct Pki {
     ca: String,
     ca_der: CertificateDer<'static>,
     issuer: Issuer<'static, KeyPair>,
+    ttl: Duration,
 }
 
 impl std::fmt::Debug for Pki {
@@ -107,7 +110,13 @@ impl Pki {
         let issuer = Issuer::from_ca_cert_pem(&pair.certificate, key).map_err(|_| damaged())?;
         let ca_der =
             CertificateDer::from_pem_slice(pair.certificate.as_bytes()).map_err(|_| damaged())?;
-        Ok(Self { dir: dir.to_owned(), ca: pair.certificate, ca_der, issuer })
+        Ok(Self { dir: dir.to_owned(), ca: pair.certificate, ca_der, issuer, ttl: TTL })
+    }
+
+    /// The same, for certificates that count so long.
+    #[must_use]
+    pub fn with_ttl(self, ttl: Duration) -> Self {
+        Self { ttl, ..self }
     }
 
     /// The CA's certificate as PEM.
@@ -124,17 +133,17 @@ impl Pki {
 
     /// The administrator's certificate, made anew when it nears its end.
     pub(crate) fn admin(&self, now: Timestamp) -> Result<Pem, PkiError> {
-        self.keep("admin", now, |_| true, || client_params("admin", ADMINS, now))
+        self.keep("admin", now, |_| true, || client_params("admin", ADMINS, (now, self.ttl)))
     }
 
-    /// TLS for the one port. `names` are the names and addresses that clients may dial.
-    pub(crate) fn server_config(
-        &self,
-        names: &BTreeSet<String>,
-        now: Timestamp,
-    ) -> Result<ServerConfig, PkiError> {
+    /// The server's certificate, made anew when it nears its end. `names` are the names and addresses that clients may dial.
+    pub(crate) fn server(&self, names: &BTreeSet<String>, now: Timestamp) -> Result<Pem, PkiError> {
         let fits = |present: &BTreeSet<String>| present == names;
-        let pair = self.keep("server", now, fits, || server_params(names, now))?;
+        self.keep("server", now, fits, || server_params(names, (now, self.ttl)))
+    }
+
+    /// TLS for the one port, with the server's certificate.
+    pub(crate) fn server_config(&self, pair: &Pem) -> Result<ServerConfig, PkiError> {
         let damaged = || PkiError::Damaged { path: self.dir.join("server.crt") };
         let leaf =
             CertificateDer::from_pem_slice(pair.certificate.as_bytes()).map_err(|_| damaged())?;
@@ -161,7 +170,7 @@ impl Pki {
     /// [`PkiError::Make`] when the request cannot be read or its signature is wrong.
     pub fn sign_node(&self, name: &str, csr: &str, now: Timestamp) -> Result<String, PkiError> {
         let public_key = CertificateSigningRequestParams::from_pem(csr)?.public_key;
-        let params = node_params(name, now)?;
+        let params = node_params(name, (now, self.ttl))?;
         let signed =
             CertificateSigningRequestParams { params, public_key }.signed_by(&self.issuer)?;
         Ok(signed.pem())
@@ -177,7 +186,7 @@ impl Pki {
     ) -> Result<Pem, PkiError> {
         if let Some(pair) = read_pair(&self.dir, name)?
             && let Some((names, ends)) = inspect(&pair.certificate)
-            && ends - now.as_second() > RENEW_DAYS * 86_400
+            && ends - now.as_second() > self.ttl.as_secs().cast_signed() / 3
             && fits(&names)
         {
             return Ok(pair);
@@ -191,7 +200,8 @@ impl Pki {
 }
 
 fn make_ca(dir: &Path, now: Timestamp) -> Result<Pem, PkiError> {
-    let mut params = valid(CertificateParams::default(), now, CA_DAYS);
+    let ttl = Duration::from_secs(CA_DAYS.unsigned_abs() * 24 * 3600);
+    let mut params = valid(CertificateParams::default(), (now, ttl));
     params.distinguished_name = subject("muster", "muster");
     params.is_ca = IsCa::Ca(BasicConstraints::Constrained(0));
     params.key_usages = vec![KeyUsagePurpose::KeyCertSign, KeyUsagePurpose::DigitalSignature];
@@ -201,8 +211,11 @@ fn make_ca(dir: &Path, now: Timestamp) -> Result<Pem, PkiError> {
     Ok(pair)
 }
 
-fn client_params(cn: &str, o: &str, now: Timestamp) -> Result<CertificateParams, PkiError> {
-    let mut params = valid(CertificateParams::default(), now, LEAF_DAYS);
+/// From when, and for how long.
+type Term = (Timestamp, Duration);
+
+fn client_params(cn: &str, o: &str, term: Term) -> Result<CertificateParams, PkiError> {
+    let mut params = valid(CertificateParams::default(), term);
     params.distinguished_name = subject(cn, o);
     params.key_usages = vec![KeyUsagePurpose::DigitalSignature];
     params.extended_key_usages = vec![ExtendedKeyUsagePurpose::ClientAuth];
@@ -211,17 +224,17 @@ fn client_params(cn: &str, o: &str, now: Timestamp) -> Result<CertificateParams,
 }
 
 /// An agent is a client of the controller, and a server for frameworks that exchange messages with its executors.
-fn node_params(name: &str, now: Timestamp) -> Result<CertificateParams, PkiError> {
-    let mut params = client_params(&format!("{NODE_PREFIX}{name}"), NODES, now)?;
+fn node_params(name: &str, term: Term) -> Result<CertificateParams, PkiError> {
+    let mut params = client_params(&format!("{NODE_PREFIX}{name}"), NODES, term)?;
     let server = CertificateParams::new(vec![server_name(name)])?;
     params.subject_alt_names = server.subject_alt_names;
     params.extended_key_usages.push(ExtendedKeyUsagePurpose::ServerAuth);
     Ok(params)
 }
 
-fn server_params(names: &BTreeSet<String>, now: Timestamp) -> Result<CertificateParams, PkiError> {
+fn server_params(names: &BTreeSet<String>, term: Term) -> Result<CertificateParams, PkiError> {
     let names: Vec<String> = names.iter().cloned().collect();
-    let mut params = valid(CertificateParams::new(names)?, now, LEAF_DAYS);
+    let mut params = valid(CertificateParams::new(names)?, term);
     params.distinguished_name = subject("muster-controller", "muster");
     params.key_usages = vec![KeyUsagePurpose::DigitalSignature];
     params.extended_key_usages = vec![ExtendedKeyUsagePurpose::ServerAuth];
@@ -236,15 +249,13 @@ fn subject(cn: &str, o: &str) -> DistinguishedName {
     name
 }
 
-/// Valid from the day before, so that an agent whose clock is a little behind can still join.
-fn valid(mut params: CertificateParams, now: Timestamp, days: i64) -> CertificateParams {
-    let day = |offset: i64| {
-        let date = now.to_zoned(TimeZone::UTC).date().saturating_add(Span::new().days(offset));
-        let part = |n: i8| u8::try_from(n).expect("months and days are positive");
-        rcgen::date_time_ymd(date.year().into(), part(date.month()), part(date.day()))
-    };
-    params.not_before = day(-1);
-    params.not_after = day(days);
+/// Valid from some time before, a day at most.
+fn valid(mut params: CertificateParams, (now, ttl): Term) -> CertificateParams {
+    let epoch = rcgen::date_time_ymd(1970, 1, 1);
+    let since = |at: i64| epoch + Duration::from_secs(at.max(0).unsigned_abs());
+    let seconds = |span: Duration| span.as_secs().cast_signed();
+    params.not_before = since(now.as_second() - seconds(ttl.min(BEFORE)));
+    params.not_after = since(now.as_second() + seconds(ttl));
     params
 }
 
@@ -346,17 +357,16 @@ mod tests {
         let again = Pki::open(dir.path(), now()).unwrap();
         assert_eq!(again.ca_hash(), pki.ca_hash());
         assert_eq!(again.admin(now()).unwrap().certificate, first.certificate);
-        let late = now() + jiff::SignedDuration::from_hours(24 * (LEAF_DAYS - RENEW_DAYS + 1));
-        assert_ne!(again.admin(late).unwrap().certificate, first.certificate);
+        let at = |part: u32| now() + jiff::SignedDuration::try_from(TTL * part / 6).unwrap();
+        assert_eq!(again.admin(at(3)).unwrap().certificate, first.certificate);
+        let second = again.admin(at(5)).unwrap();
+        assert_ne!(second.certificate, first.certificate);
+        assert_eq!(again.admin(at(8)).unwrap().certificate, second.certificate);
 
-        let server = || fs::read_to_string(dir.path().join("server.crt")).unwrap();
-        pki.server_config(&names(&["localhost", "127.0.0.1", "::1"]), now()).unwrap();
-        let one = server();
-        pki.server_config(&names(&["localhost", "127.0.0.1", "::1"]), now()).unwrap();
-        assert_eq!(server(), one);
-        pki.server_config(&names(&["localhost", "127.0.0.1", "::1", "lab.example"]), now())
-            .unwrap();
-        assert_ne!(server(), one);
+        let server = |hosts: &[&str]| pki.server(&names(hosts), now()).unwrap().certificate;
+        let one = server(&["localhost", "127.0.0.1", "::1"]);
+        assert_eq!(server(&["localhost", "127.0.0.1", "::1"]), one);
+        assert_ne!(server(&["localhost", "127.0.0.1", "::1", "lab.example"]), one);
     }
 
     #[test]

@@ -16,7 +16,7 @@ use muster_api::wire::{HTTP2_FRAME, HTTP2_WINDOW};
 use rustix::net::sockopt;
 use rustls::ServerConfig;
 use tokio::net::{TcpListener, TcpStream};
-use tokio::sync::{OwnedSemaphorePermit, Semaphore};
+use tokio::sync::{OwnedSemaphorePermit, Semaphore, watch};
 use tokio_rustls::TlsAcceptor;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
@@ -39,7 +39,8 @@ const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
 /// What a connection needs.
 #[derive(Clone)]
 pub(crate) struct Server {
-    pub(crate) tls: Arc<ServerConfig>,
+    /// The newest: a connection has that of its beginning.
+    pub(crate) tls: watch::Receiver<Arc<ServerConfig>>,
     pub(crate) router: Router,
     /// Finish what is being answered, take nothing new.
     pub(crate) stop: CancellationToken,
@@ -214,7 +215,8 @@ impl Server {
         let Self { tls, router, stop, kill, limits, .. } = self;
         watch_over(&stream)?;
         let peer = Peer(stream.peer_addr()?);
-        let handshake = TlsAcceptor::from(tls).accept(stream);
+        let newest = Arc::clone(&tls.borrow());
+        let handshake = TlsAcceptor::from(newest).accept(stream);
         let stream = tokio::select! {
             () = stop.cancelled() => return Ok(()),
             stream = tokio::time::timeout(HANDSHAKE, handshake) => stream??,

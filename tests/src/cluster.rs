@@ -31,6 +31,8 @@ pub struct Cluster {
     agents: BTreeMap<String, Agent>,
     /// Taken from the kernel at the first start and kept for restarts.
     listen: String,
+    /// Of the controller, beside those that every test's has.
+    flags: Vec<String>,
 }
 
 #[derive(Debug)]
@@ -113,6 +115,11 @@ fn built(path: &str, what: &str) -> PathBuf {
 impl Cluster {
     /// A controller without nodes.
     pub async fn start() -> Self {
+        Self::start_with(&[]).await
+    }
+
+    /// The same, with flags of the controller's.
+    pub async fn start_with(flags: &[&str]) -> Self {
         // Both TLS providers may be linked in; the one that is meant must be said.
         drop(rustls::crypto::ring::default_provider().install_default());
         let dir = TempDir::with_prefix("muster-test-").expect("a temporary directory");
@@ -121,6 +128,7 @@ impl Cluster {
             controller: None,
             agents: BTreeMap::new(),
             listen: "127.0.0.1:0".to_owned(),
+            flags: flags.iter().map(|&flag| flag.to_owned()).collect(),
         };
         cluster.start_controller().await;
         cluster
@@ -178,6 +186,7 @@ impl Cluster {
             .arg(self.dir.path().join("controller"))
             .arg("--kubeconfig")
             .arg(self.kubeconfig())
+            .args(&self.flags)
             .stdin(Stdio::null())
             .stdout(self.log("controller"))
             .stderr(self.log("controller"))

@@ -25,6 +25,7 @@ use rustix::net::sockopt;
 use rustls::ServerConfig;
 use tokio::io::{AsyncRead, AsyncReadExt as _, AsyncWrite, AsyncWriteExt as _, BufReader};
 use tokio::net::{TcpListener, TcpStream};
+use tokio::sync::watch;
 use tokio::task::JoinSet;
 use tokio::time::timeout;
 use tokio_rustls::TlsAcceptor;
@@ -74,10 +75,14 @@ impl FromStr for Where {
     }
 }
 
+/// What is shown to frameworks, and whom it believes.
+type Tls = watch::Receiver<Arc<ServerConfig>>;
+
 /// Where frameworks may come.
 pub(crate) struct Door {
     place: Where,
-    tls: Option<TlsAcceptor>,
+    /// The newest: a connection has that of its beginning.
+    tls: Option<Tls>,
     desks: Arc<Desks>,
     open: Option<Open>,
 }
@@ -95,8 +100,7 @@ impl fmt::Debug for Door {
 }
 
 impl Door {
-    pub(crate) fn new(place: Where, tls: Option<ServerConfig>, desks: Arc<Desks>) -> Door {
-        let tls = tls.map(|tls| TlsAcceptor::from(Arc::new(tls)));
+    pub(crate) fn new(place: Where, tls: Option<Tls>, desks: Arc<Desks>) -> Door {
         Door { place, tls, desks, open: None }
     }
 
@@ -127,7 +131,7 @@ impl Door {
     }
 }
 
-async fn listen(at: SocketAddr, tls: TlsAcceptor, desks: Arc<Desks>) -> io::Result<Open> {
+async fn listen(at: SocketAddr, tls: Tls, desks: Arc<Desks>) -> io::Result<Open> {
     let listener = TcpListener::bind(at).await?;
     let at = listener.local_addr()?;
     tracing::info!(%at, "takes messages of frameworks");
@@ -135,7 +139,7 @@ async fn listen(at: SocketAddr, tls: TlsAcceptor, desks: Arc<Desks>) -> io::Resu
     Ok(Open { at, _listener: AbortOnDropHandle::new(listener) })
 }
 
-async fn serve(listener: TcpListener, tls: TlsAcceptor, desks: Arc<Desks>) {
+async fn serve(listener: TcpListener, tls: Tls, desks: Arc<Desks>) {
     let mut strangers: VecDeque<CancellationToken> = VecDeque::new();
     let mut lines = JoinSet::new();
     loop {
@@ -155,7 +159,8 @@ async fn serve(listener: TcpListener, tls: TlsAcceptor, desks: Arc<Desks>) {
                     }
                     let stranger = CancellationToken::new();
                     strangers.push_back(stranger.clone());
-                    lines.spawn(line(tcp, tls.clone(), Arc::clone(&desks), stranger));
+                    let tls = TlsAcceptor::from(Arc::clone(&tls.borrow()));
+                    lines.spawn(line(tcp, tls, Arc::clone(&desks), stranger));
                 }
                 Err(error) => {
                     tracing::warn!(%error, "the listener for frameworks");

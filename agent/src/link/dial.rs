@@ -7,6 +7,7 @@ use std::time::Duration;
 use hyper_util::rt::TokioIo;
 use muster_api::wire::{HTTP2_FRAME, HTTP2_WINDOW};
 use rustls::ClientConfig;
+use tokio::sync::watch;
 use tokio::time::Instant;
 use tonic::transport::{Channel, Endpoint};
 
@@ -80,7 +81,8 @@ pub(crate) struct DialError(#[source] tonic::transport::Error);
 #[derive(Debug, Clone)]
 pub(crate) struct Dialer {
     pub(crate) address: Address,
-    pub(crate) tls: Arc<ClientConfig>,
+    /// The newest: a connection has that of its beginning.
+    pub(crate) tls: watch::Receiver<Arc<ClientConfig>>,
 }
 
 impl Dialer {
@@ -103,7 +105,7 @@ impl Dialer {
             .http2_keep_alive_interval(deaf_after / 2)
             .keep_alive_timeout(deaf_after / 2)
             .keep_alive_while_idle(true);
-        let (address, tls) = (self.address.clone(), Arc::clone(&self.tls));
+        let (address, tls) = (self.address.clone(), Arc::clone(&self.tls.borrow()));
         let own = Arc::new(OnceLock::new());
         let found = Arc::clone(&own);
         let connector = tower::service_fn(move |_: http::Uri| {

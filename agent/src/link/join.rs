@@ -1,4 +1,9 @@
-//! From a token to a certificate, once a token. The key is made here and never leaves.
+//! From a token, or from the certificate that is there, to a new one. The key is made here and never leaves.
+//!
+//! ```text
+//!   DIR/pki/ca.crt node.key token-id node.crt   what a join gave, written in this order
+//!   DIR/pki/renewed.json                        those of the last renewal, in one file: it is there whole or not
+//! ```
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -14,7 +19,7 @@ use rustls::{ClientConfig, ServerConfig};
 use serde::{Deserialize, Serialize};
 
 use super::Address;
-use super::tls::{self, ConnectError};
+use super::tls::{self, ConnectError, Term};
 use super::token::Token;
 use crate::config::Kind;
 use crate::durable::{self, FileError, Keep};
@@ -24,6 +29,9 @@ const PATIENCE: Duration = Duration::from_secs(20);
 
 /// An answer holds two certificates, or a status.
 const LONGEST_ANSWER: usize = 256 << 10;
+
+/// The file of the last renewal.
+const RENEWED: &str = "renewed.json";
 
 /// Why this agent has not joined.
 #[derive(Debug, thiserror::Error)]
@@ -66,7 +74,9 @@ pub(crate) struct Credentials {
 #[derive(Serialize)]
 #[serde(rename_all = "camelCase")]
 struct JoinRequest<'a> {
-    token: &'a str,
+    /// Absent: the connection's certificate speaks for it.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    token: Option<&'a str>,
     node_name: &'a str,
     kind: &'static str,
     csr: String,
@@ -76,6 +86,14 @@ struct JoinRequest<'a> {
 struct JoinAnswer {
     certificate: String,
     ca: String,
+}
+
+/// What a renewal gave, as it is kept: PEM.
+#[derive(Serialize, Deserialize)]
+struct Renewed {
+    ca: String,
+    certificate: String,
+    key: String,
 }
 
 #[derive(Deserialize)]
@@ -113,23 +131,40 @@ impl Credentials {
         Ok(tls::serving(&ca, &certificate, &key, node)?)
     }
 
+    /// From when to when the certificate counts.
+    pub(crate) fn term(&self) -> Result<Term, JoinError> {
+        let [_, certificate, _] = self.read()?;
+        Ok(tls::term(&certificate)?)
+    }
+
+    /// CA, certificate and key.
     fn read(&self) -> Result<[Vec<u8>; 3], FileError> {
         let read = |name: &str| {
             let path = self.dir.join(name);
             std::fs::read(&path).map_err(FileError::at("read", &path))
         };
-        Ok([read("ca.crt")?, read("node.crt")?, read("node.key")?])
+        match durable::read_json::<Renewed>(&self.dir.join(RENEWED))? {
+            Some(Renewed { ca, certificate, key }) => Ok([ca, certificate, key].map(Into::into)),
+            None => Ok([read("ca.crt")?, read("node.crt")?, read("node.key")?]),
+        }
+    }
+
+    fn renew(&self, key: String, answer: JoinAnswer) -> Result<(), FileError> {
+        let JoinAnswer { certificate, ca } = answer;
+        let renewed = Renewed { ca, certificate, key };
+        durable::write_json(&self.dir.join(RENEWED), &renewed, Keep::PowerCut)
     }
 
     fn write(&self, key: &str, answer: &JoinAnswer, token: &Token) -> Result<(), FileError> {
         std::fs::create_dir_all(&self.dir).map_err(FileError::at("make", &self.dir))?;
         // Those of an earlier join end first: a key never stands beside another's certificate.
-        let certificate = self.dir.join("node.crt");
-        match std::fs::remove_file(&certificate) {
-            Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
-                return Err(FileError::at("remove", &certificate)(error));
+        for former in [RENEWED, "node.crt"].map(|name| self.dir.join(name)) {
+            match std::fs::remove_file(&former) {
+                Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
+                    return Err(FileError::at("remove", &former)(error));
+                }
+                _ => {}
             }
-            _ => {}
         }
         for (name, text) in [
             ("node.key", key),
@@ -151,6 +186,32 @@ pub(crate) async fn join(
     kind: Kind,
     credentials: &Credentials,
 ) -> Result<(), JoinError> {
+    let config = tls::by_hash(token.ca_hash)?;
+    let (key, answer) = ask((address, config), Some(token), (node, kind)).await?;
+    credentials.write(&key, &answer, token)?;
+    Ok(())
+}
+
+/// Asks for another certificate by the one that is there, and stores it.
+pub(crate) async fn renew(
+    address: &Address,
+    (node, kind): (&str, Kind),
+    credentials: &Credentials,
+) -> Result<(), JoinError> {
+    let mut config = credentials.tls()?;
+    // One request, and no streams.
+    config.alpn_protocols = vec![b"http/1.1".to_vec()];
+    let (key, answer) = ask((address, config), None, (node, kind)).await?;
+    credentials.renew(key, answer)?;
+    Ok(())
+}
+
+/// A new key, as PEM, and what the controller gives for it.
+async fn ask(
+    (address, config): (&Address, ClientConfig),
+    token: Option<&Token>,
+    (node, kind): (&str, Kind),
+) -> Result<(String, JoinAnswer), JoinError> {
     let key = KeyPair::generate().map_err(JoinError::Key)?;
     let mut params = CertificateParams::default();
     params.distinguished_name.push(DnType::CommonName, node);
@@ -159,9 +220,10 @@ pub(crate) async fn join(
         Kind::Robot => "Robot",
         Kind::Cloud => "Cloud",
     };
-    let body = serde_json::to_vec(&JoinRequest { token: &token.text, node_name: node, kind, csr })
+    let token = token.map(|token| token.text.as_str());
+    let body = serde_json::to_vec(&JoinRequest { token, node_name: node, kind, csr })
         .map_err(|error| JoinError::Http(error.into()))?;
-    let asked = post(address, token, body.into());
+    let asked = post(address, config, body.into());
     let (status, body) = match tokio::time::timeout(PATIENCE, asked).await {
         Ok(answer) => answer?,
         Err(late) => return Err(JoinError::Http(late.into())),
@@ -173,17 +235,15 @@ pub(crate) async fn join(
     }
     let answer: JoinAnswer =
         serde_json::from_slice(&body).map_err(|error| JoinError::Http(error.into()))?;
-    credentials.write(&key.serialize_pem(), &answer, token)?;
-    Ok(())
+    Ok((key.serialize_pem(), answer))
 }
 
 async fn post(
     address: &Address,
-    token: &Token,
+    config: ClientConfig,
     body: Bytes,
 ) -> Result<(StatusCode, Vec<u8>), JoinError> {
-    let config = Arc::new(tls::by_hash(token.ca_hash)?);
-    let stream = tls::connect(address, config).await.map_err(|error| match &error {
+    let stream = tls::connect(address, Arc::new(config)).await.map_err(|error| match &error {
         ConnectError::Tls { source, .. } if is_unknown_issuer(source) => {
             JoinError::WrongCa(address.to_string())
         }

@@ -5,6 +5,7 @@
 //! | [`token`] | join tokens |
 //! | [`tls`] | whom the agent believes, and who it says it is |
 //! | [`join`] | from a token to a certificate, once |
+//! | [`renewal`] | a certificate that nears its end against a new one |
 //! | [`dial`] | connections to the controller |
 //! | [`messages`] | messages of executors, on a connection of their own |
 //! | [`orders`] | emergency stops, on a connection of their own |
@@ -16,6 +17,7 @@ pub(crate) mod dial;
 pub(crate) mod join;
 pub(crate) mod messages;
 pub(crate) mod orders;
+pub(crate) mod renewal;
 pub(crate) mod report;
 pub(crate) mod session;
 pub(crate) mod stream_logs;

@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 
+use jiff::Timestamp;
 use muster_api::direct::{ALPN, server_name};
 use muster_api::wire::READ_BUFFER;
 use rustls::client::danger::{HandshakeSignatureValid, ServerCertVerified, ServerCertVerifier};
@@ -86,6 +87,25 @@ impl Own {
         let key = PrivateKeyDer::from_pem_slice(key).map_err(bad)?;
         Ok(Own { roots, chain, key })
     }
+}
+
+/// From when to when a certificate counts.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Term {
+    pub(crate) from: Timestamp,
+    pub(crate) to: Timestamp,
+}
+
+/// The term of the first of these certificates (PEM).
+pub(crate) fn term(certificates: &[u8]) -> Result<Term, ConnectError> {
+    let bad =
+        || ConnectError::Credentials(Error::InvalidCertificate(CertificateError::BadEncoding));
+    let leaf = CertificateDer::from_pem_slice(certificates).map_err(|_| bad())?;
+    let (_, leaf) = x509_parser::parse_x509_certificate(&leaf).map_err(|_| bad())?;
+    let time = |at: x509_parser::time::ASN1Time| Timestamp::from_second(at.timestamp());
+    let validity = leaf.validity();
+    let from = time(validity.not_before).map_err(|_| bad())?;
+    Ok(Term { from, to: time(validity.not_after).map_err(|_| bad())? })
 }
 
 /// For frameworks that come directly: shows the certificate of `node`, and believes clients of the CA of the join. None: the

@@ -19,6 +19,8 @@ pub(super) struct Candidate<'a> {
     pub(super) kind: NodeKind,
     /// Of the certificate that it will have.
     pub(super) key: String,
+    /// Of the one that it shows, if it is a node's.
+    pub(super) shown: Option<&'a str>,
 }
 
 /// By what right somebody becomes a node's agent.
@@ -96,9 +98,15 @@ pub(super) async fn enrol(
         if right == Right::AnyNode && has_joined(&node) {
             return Err(taken(name));
         }
+        if right == Right::Renewal && !candidate.shown.is_some_and(|key| is_agent_of(&node, key)) {
+            let message = format!(
+                "the certificate is not that of node {name:?}'s agent any more; a join token is needed"
+            );
+            return Err(Failure::unauthorized(message));
+        }
         let keys = &mut node.status.get_or_insert_default().agent_keys;
-        // The answer to a renewal may get lost, and then the present certificate is all there is.
-        keys.truncate(usize::from(right == Right::Renewal));
+        // The answer to a renewal may get lost, and then the certificate that was shown is all there is.
+        keys.retain(|key| right == Right::Renewal && candidate.shown == Some(key));
         keys.insert(0, candidate.key.clone());
         match context.store.apply_one(objects::replace(&stored, &node)).await {
             Ok(_) => return Ok(()),

@@ -43,13 +43,19 @@ pub(super) async fn join(call: Call) -> Answer {
         .pki
         .sign_node(&asked.node_name, &asked.csr, context.clock.now())
         .map_err(|error| Failure::bad_request(format!("csr: {}", crate::app::chain(&error))))?;
-    let candidate =
-        Candidate { node: &asked.node_name, kind: asked.kind, key: key_of(&certificate)? };
+    let shown = match &asker.identity {
+        Identity::Node { name, key } if *name == asked.node_name => Some(key.as_str()),
+        _ => None,
+    };
+    let (node, kind) = (asked.node_name.as_str(), asked.kind);
+    let candidate = Candidate { node, kind, key: key_of(&certificate)?, shown };
     let taken = enrol::check(&context, &candidate)?;
     let right = right(&context, &asked, &asker.identity, taken).await?;
     enrol::enrol(&context, &candidate, right).await?;
-    // Whoever spoke for the node until now has to show the key that counts.
-    if let (Some(live), Ok(name)) = (context.live(), asked.node_name.parse()) {
+    // Whoever spoke for the node until now has to show the key that counts; who renews a certificate goes on meanwhile.
+    if right != Right::Renewal
+        && let (Some(live), Ok(name)) = (context.live(), asked.node_name.parse())
+    {
         live.sessions.kick(&name);
     }
     tracing::info!(node = asked.node_name, kind = ?asked.kind, ?right, "joined");

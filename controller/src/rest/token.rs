@@ -304,6 +304,7 @@ pub(super) mod tests {
             kubeconfig_asked: true,
             advertise: Vec::new(),
             encryption_key: None,
+            certificate_ttl: crate::pki::TTL,
         };
         let (store, address) = (crate::store::memory::start().await, config.listen);
         let (events, _) = Recorder::new();

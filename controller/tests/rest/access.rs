@@ -79,6 +79,41 @@ async fn an_agent_joins_with_a_token_and_speaks_for_its_node_only() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_certificate_is_renewed_until_another_agent_is_in_its_place() {
+    let cluster = Cluster::start().await;
+    let (admin, anonymous) = (cluster.admin().await, cluster.anonymous().await);
+    let path = format!("{G}/join");
+    let token = async || {
+        let spec = json!({"spec": {"nodeName": "r1", "uses": 1}});
+        let (code, made) = send(&admin, "POST", &format!("{G}/jointokens"), spec).await;
+        assert_eq!(code, 201, "{made}");
+        made["status"]["token"].as_str().unwrap().to_owned()
+    };
+    let (csr, key) = request();
+    let (_, joined) = send(&anonymous, "POST", &path, join(&token().await, "r1", &csr)).await;
+    let certificate = joined["certificate"].as_str().unwrap();
+    let agent = cluster.holder(certificate, &key.serialize_pem()).await;
+
+    // Of a renewal whose answer was lost, as often as it may be, the agent knows nothing.
+    for _ in 0..3 {
+        let renew = json!({"nodeName": "r1", "kind": "Robot", "csr": request().0});
+        let (code, renewed) = send(&agent, "POST", &path, renew).await;
+        assert_eq!(code, 200, "{renewed}");
+        let (_, node) = get(&admin, &format!("{G}/nodes/r1")).await;
+        let keys = node["status"]["agentKeys"].as_array().unwrap();
+        assert_eq!(keys.len(), 2, "the new one, and the one that was shown: {keys:?}");
+    }
+    let (other, _) = request();
+    let (code, _) = send(&anonymous, "POST", &path, join(&token().await, "r1", &other)).await;
+    assert_eq!(code, 200, "a replacement");
+    let renew = json!({"nodeName": "r1", "kind": "Robot", "csr": request().0});
+    let refused = send(&agent, "POST", &path, renew).await;
+    assert_eq!(refusal(&refused), (401, "Unauthorized"));
+    assert!(refused.1["message"].as_str().unwrap().contains("any more"), "{}", refused.1);
+    cluster.running.shut_down().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_token_that_does_not_hold_says_why() {
     let cluster = Cluster::start().await;
     let (admin, anonymous) = (cluster.admin().await, cluster.anonymous().await);
@@ -115,6 +150,7 @@ async fn a_second_controller_on_the_same_directory_is_refused() {
         kubeconfig_asked: true,
         advertise: Vec::new(),
         encryption_key: None,
+        certificate_ttl: muster_controller::pki::TTL,
     };
     let refused = app::start(config).await.unwrap_err();
     assert!(matches!(refused, app::AppError::Locked { .. }), "{refused}");

@@ -138,6 +138,7 @@ fn config(dir: &TempDir) -> Config {
         kubeconfig_asked: true,
         advertise: Vec::new(),
         encryption_key: None,
+        certificate_ttl: muster_controller::pki::TTL,
     }
 }
 

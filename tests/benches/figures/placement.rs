@@ -119,6 +119,7 @@ pub(crate) async fn queue() {
             kubeconfig_asked: true,
             advertise: Vec::new(),
             encryption_key: None,
+            certificate_ttl: muster_controller::pki::TTL,
         };
         let running = app::start(config).await.expect("a controller");
         let store = running.context().store.clone();

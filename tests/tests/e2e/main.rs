@@ -2,6 +2,7 @@
 
 mod access;
 mod applications;
+mod certificates;
 mod cli;
 mod config;
 mod demo;

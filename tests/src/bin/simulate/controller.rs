@@ -367,5 +367,6 @@ fn config(dir: &Path, listen: SocketAddr) -> Config {
         kubeconfig_asked: true,
         advertise: Vec::new(),
         encryption_key: None,
+        certificate_ttl: muster_controller::pki::TTL,
     }
 }
