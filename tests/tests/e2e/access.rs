@@ -51,7 +51,7 @@ fn as_user(config: &PathBuf, args: &[&str]) -> (i32, String, String) {
 #[tokio::test(flavor = "multi_thread")]
 async fn who_has_a_token_may_what_their_role_says() {
     let mut cluster = Cluster::start().await;
-    cluster.join(AgentOptions::robot("tb-1", 3.0, 0.0)).await;
+    cluster.join(AgentOptions::robot("tb-1", 3.0, 0.0).flag("--docker-socket", "none")).await;
     let file = cluster.dir().join("roles.yaml");
     std::fs::write(&file, ROLES).expect("the directory is there");
     let said = muster(&cluster, &["apply", "-f", file.to_str().expect("text")]);

@@ -16,7 +16,7 @@ const LARGE: usize = 256 << 10;
 
 async fn cloud() -> (Cluster, Echo) {
     let mut cluster = Cluster::start().await;
-    cluster.join(AgentOptions::cloud("cloud")).await;
+    cluster.join(AgentOptions::cloud("cloud").flag("--docker-socket", "none")).await;
     let echo = Echo::start(&cluster, "cloud").await;
     (cluster, echo)
 }
@@ -113,7 +113,11 @@ async fn dial(
 #[tokio::test(flavor = "multi_thread")]
 async fn an_agent_that_does_not_listen_is_reached_through_the_controller() {
     let mut cluster = Cluster::start().await;
-    cluster.join(AgentOptions::cloud("cloud").flag("--messages", "none")).await;
+    cluster
+        .join(
+            AgentOptions::cloud("cloud").flag("--docker-socket", "none").flag("--messages", "none"),
+        )
+        .await;
     let mut echo = Echo::start(&cluster, "cloud").await;
     for n in 1..=20 {
         echo.round(&numbered(n)).await;
@@ -253,7 +257,7 @@ async fn hear(echo: &mut Echo, seen: &mut Vec<u64>, count: usize) {
 #[tokio::test(flavor = "multi_thread")]
 async fn a_later_session_takes_the_place_of_the_one_before() {
     let mut cluster = Cluster::start().await;
-    cluster.join(AgentOptions::cloud("cloud")).await;
+    cluster.join(AgentOptions::cloud("cloud").flag("--docker-socket", "none")).await;
     let state = cluster.dir().join("framework-id");
     let framework = || Framework::builder("crew").state_file(&state);
     let mut first = Echo::launch(framework(), &cluster, "cloud").await;
