@@ -46,7 +46,7 @@ use crate::session::poses::{self, LivePoses};
 use crate::session::proto::exec_service_server::ExecServiceServer;
 use crate::session::{self, Sessions};
 use crate::store::{self, OpenError, StoreError};
-use crate::{auth, footprint, kubeconfig, metrics, reconcile, rest};
+use crate::{auth, footprint, kubeconfig, metrics, rates, reconcile, rest};
 
 /// How long requests in flight may take to finish after a signal.
 const DEADLINE: Duration = Duration::from_secs(5);
@@ -269,6 +269,7 @@ fn router(context: &Arc<Context>, (agents, publishers): (Agents, poses::Service)
         .merge(frameworks.unwrap_or_default())
         .merge(execs.unwrap_or_default())
         .merge(rest::router(Arc::clone(context)))
+        .layer(from_fn_with_state(Arc::clone(context), rates::hold_back))
         .layer(from_fn_with_state(Arc::clone(context), auth::by_token))
         .layer(CatchPanicLayer::custom(fault))
 }
@@ -434,6 +435,7 @@ mod tests {
             advertise: Vec::new(),
             encryption_key: None,
             certificate_ttl: crate::pki::TTL,
+            requests_per_second: crate::config::REQUESTS_PER_SECOND,
         }
     }
 

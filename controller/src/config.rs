@@ -6,6 +6,9 @@ use std::time::Duration;
 
 use muster_api::duration::Span;
 
+/// Requests a second of one user where nobody says otherwise: what a controller on a small machine answers ten times over.
+pub const REQUESTS_PER_SECOND: u32 = 500;
+
 /// A certificate that counts for less could end before its holder has seen that it is to be renewed.
 const SHORTEST_TTL: Duration = Duration::from_secs(60);
 
@@ -32,6 +35,9 @@ pub struct Args {
     /// How long a certificate counts that this controller signs; all are renewed by themselves in time
     #[arg(long, value_name = "DURATION", default_value = "8760h", value_parser = certificate_ttl)]
     pub certificate_ttl: Span,
+    /// Requests a second of one user, and twice as many at once; administrators and agents are not counted. 0: any number
+    #[arg(long, value_name = "N", default_value_t = REQUESTS_PER_SECOND)]
+    pub requests_per_second: u32,
 }
 
 /// What the controller needs to know to run.
@@ -51,6 +57,8 @@ pub struct Config {
     pub encryption_key: Option<PathBuf>,
     /// How long a certificate counts; [`pki::TTL`](crate::pki::TTL) where nobody says otherwise.
     pub certificate_ttl: Duration,
+    /// Requests a second of one user; 0: any number.
+    pub requests_per_second: u32,
 }
 
 fn certificate_ttl(text: &str) -> Result<Span, String> {
@@ -75,6 +83,7 @@ impl From<Args> for Config {
             advertise: args.advertise,
             encryption_key: args.encryption_key,
             certificate_ttl: args.certificate_ttl.as_duration(),
+            requests_per_second: args.requests_per_second,
         }
     }
 }

@@ -14,6 +14,7 @@ use crate::config::Config;
 use crate::events::Recorder;
 use crate::pki::Pki;
 use crate::quota::Door;
+use crate::rates::Rates;
 use crate::reconcile::schedule;
 use crate::rest::log::LogSource;
 use crate::rest::{Bodies, Rendered, Streams};
@@ -72,6 +73,7 @@ pub struct Context {
     pub audit: Audit,
     /// What Access objects give, read.
     pub(crate) rights: Rights,
+    pub(crate) rates: Rates,
     /// Cancelled when a part of the controller has failed for good: the process is to end, and to be started again.
     pub(crate) broken: CancellationToken,
     /// Held while a task is given to a node (shared) and while a Node is deleted (alone): a Node is found unused and is
@@ -113,6 +115,7 @@ impl Context {
         Self {
             audit: Audit::in_dir(config.data_dir.join("audit")),
             rights: Rights::default(),
+            rates: Rates::new(config.requests_per_second),
             store,
             clock: Arc::new(SystemClock),
             pki,
@@ -186,6 +189,7 @@ pub(crate) fn for_tests(dir: &std::path::Path, store: Store) -> Arc<Context> {
         advertise: Vec::new(),
         encryption_key: None,
         certificate_ttl: crate::pki::TTL,
+        requests_per_second: crate::config::REQUESTS_PER_SECOND,
     };
     let (address, (events, _)) = (config.listen, Recorder::new());
     let metrics = crate::metrics::recorder().expect("the process's recorder");

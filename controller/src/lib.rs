@@ -30,6 +30,7 @@ mod metrics;
 pub mod objects;
 pub mod pki;
 mod quota;
+mod rates;
 pub mod reconcile;
 pub mod rest;
 mod serve;

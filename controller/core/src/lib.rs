@@ -63,6 +63,7 @@ pub mod preempt;
 pub mod project;
 pub mod quota;
 pub mod radius;
+pub mod rate;
 pub mod recent;
 pub mod report;
 pub mod reschedule;

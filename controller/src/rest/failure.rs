@@ -1,5 +1,7 @@
 //! Every refusal as a `metav1.Status`, with the reasons and causes that clients look at.
 
+use std::time::Duration;
+
 use axum::response::{IntoResponse, Response};
 use http::{Method, StatusCode};
 use muster_api::validate::Violations;
@@ -128,6 +130,15 @@ impl Failure {
         let message = "too many requests at once; try again";
         let code = StatusCode::TOO_MANY_REQUESTS;
         Self::new(code, "TooManyRequests", message).retry_after(1)
+    }
+
+    /// A user asks more often than they may.
+    pub(crate) fn too_often(user: &str, after: Duration) -> Self {
+        let message =
+            format!("User {user:?} asks too often; try again in {:.1} s", after.as_secs_f64());
+        let code = StatusCode::TOO_MANY_REQUESTS;
+        let seconds = after.as_secs() + u64::from(after.subsec_nanos() > 0);
+        Self::new(code, "TooManyRequests", message).retry_after(seconds)
     }
 
     pub(crate) fn internal(message: impl Into<String>) -> Self {

@@ -305,6 +305,7 @@ pub(super) mod tests {
             advertise: Vec::new(),
             encryption_key: None,
             certificate_ttl: crate::pki::TTL,
+            requests_per_second: crate::config::REQUESTS_PER_SECOND,
         };
         let (store, address) = (crate::store::memory::start().await, config.listen);
         let (events, _) = Recorder::new();

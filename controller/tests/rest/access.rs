@@ -151,6 +151,7 @@ async fn a_second_controller_on_the_same_directory_is_refused() {
         advertise: Vec::new(),
         encryption_key: None,
         certificate_ttl: muster_controller::pki::TTL,
+        requests_per_second: muster_controller::config::REQUESTS_PER_SECOND,
     };
     let refused = app::start(config).await.unwrap_err();
     assert!(matches!(refused, app::AppError::Locked { .. }), "{refused}");

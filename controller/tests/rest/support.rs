@@ -24,8 +24,15 @@ pub(crate) struct Cluster {
 
 impl Cluster {
     pub(crate) async fn start() -> Self {
+        Self::start_with(|_| {}).await
+    }
+
+    /// With other settings than every test's.
+    pub(crate) async fn start_with(change: impl FnOnce(&mut Config)) -> Self {
         let dir = tempfile::tempdir().unwrap();
-        let running = app::start(config(&dir)).await.unwrap();
+        let mut config = config(&dir);
+        change(&mut config);
+        let running = app::start(config).await.unwrap();
         Self { running, dir }
     }
 
@@ -139,6 +146,7 @@ fn config(dir: &TempDir) -> Config {
         advertise: Vec::new(),
         encryption_key: None,
         certificate_ttl: muster_controller::pki::TTL,
+        requests_per_second: muster_controller::config::REQUESTS_PER_SECOND,
     }
 }
 

@@ -33,6 +33,36 @@ async fn a_token_lets_its_user_in_until_it_is_taken_back() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_user_who_asks_too_often_waits_and_nobody_else() {
+    let cluster = Cluster::start_with(|config| config.requests_per_second = 1).await;
+    let (ada, bob) = (cluster.user("ada").await, cluster.user("bob").await);
+    let deadline = std::time::Instant::now() + DEADLINE;
+    let refused = loop {
+        let answer = get(&ada, "/apis").await;
+        if answer.0 != 200 {
+            break answer;
+        }
+        assert!(std::time::Instant::now() < deadline, "nobody asks so seldom");
+    };
+    assert_eq!(refusal(&refused), (429, "TooManyRequests"));
+    let (message, details) = (refused.1["message"].as_str().unwrap(), &refused.1["details"]);
+    assert!(message.contains("User \"ada\" asks too often"), "{message}");
+    assert_eq!(details["retryAfterSeconds"], 1);
+    assert_eq!(get(&bob, "/apis").await.0, 200);
+    // An emergency stop is not asked how often: it is for the table of roles to say who may.
+    let stop = json!({"spec": {"emergencyStop": {}}});
+    for _ in 0..20 {
+        let answer = send(&ada, "PATCH", &format!("{G}/nodes/r1"), stop.clone()).await;
+        assert_eq!(refusal(&answer), (403, "Forbidden"));
+    }
+    let admin = cluster.admin().await;
+    for _ in 0..20 {
+        assert_eq!(get(&admin, "/apis").await.0, 200);
+    }
+    cluster.running.shut_down().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_token_that_does_not_hold_counts_before_a_certificate_that_does() {
     let cluster = Cluster::start().await;
     let admin = cluster.admin().await;

@@ -120,6 +120,7 @@ pub(crate) async fn queue() {
             advertise: Vec::new(),
             encryption_key: None,
             certificate_ttl: muster_controller::pki::TTL,
+            requests_per_second: muster_controller::config::REQUESTS_PER_SECOND,
         };
         let running = app::start(config).await.expect("a controller");
         let store = running.context().store.clone();

@@ -368,5 +368,6 @@ fn config(dir: &Path, listen: SocketAddr) -> Config {
         advertise: Vec::new(),
         encryption_key: None,
         certificate_ttl: muster_controller::pki::TTL,
+        requests_per_second: muster_controller::config::REQUESTS_PER_SECOND,
     }
 }
