@@ -315,8 +315,15 @@ pub async fn serve(
     let door = Door::new(config.messages.clone(), shown, Arc::clone(&shared.desks));
     let client = watch::Sender::new(Arc::new(credentials.tls()?));
     let dialer = Dialer { address: address.clone(), tls: client.subscribe() };
-    let renewal =
-        Renewal { address, node: shared.node.clone(), kind, credentials, client, server: serving };
+    let renewal = Renewal {
+        address,
+        node: shared.node.clone(),
+        kind,
+        credentials,
+        client,
+        server: serving,
+        shown: Vec::new(),
+    };
     let _renewal = AbortOnDropHandle::new(tokio::spawn(renewal.run()));
     let orders = keeper.clone().map(|gate| Orders {
         dialer: dialer.clone(),

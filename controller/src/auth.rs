@@ -239,7 +239,7 @@ pub(crate) fn stream<'a>(
 }
 
 /// How often it is looked whether those who were let in to something that lasts may still have it.
-const LOOK_AGAIN: Duration = Duration::from_secs(2);
+pub(crate) const LOOK_AGAIN: Duration = Duration::from_secs(2);
 
 /// Whether somebody may do this at this moment, also by what they showed: their token may have ended since.
 pub(crate) fn still_may(context: &Context, identity: &Identity, asked: &Asked<'_>) -> bool {

@@ -161,6 +161,9 @@ impl Pki {
             // The CA goes along so that a joining agent can hold it against the hash in its token.
             .with_single_cert(vec![leaf, self.ca_der.clone()], key)?;
         config.alpn_protocols = vec![b"h2".to_vec(), b"http/1.1".to_vec()];
+        // A session that is resumed has the certificate of its beginning, which may not count any more.
+        config.session_storage = Arc::new(rustls::server::NoServerSessionStorage {});
+        config.send_tls13_tickets = 0;
         Ok(config)
     }
 
@@ -185,7 +188,9 @@ impl Pki {
         params: impl Fn() -> Result<CertificateParams, PkiError>,
     ) -> Result<Pem, PkiError> {
         if let Some(pair) = read_pair(&self.dir, name)?
-            && let Some((names, ends)) = inspect(&pair.certificate)
+            && let Some((names, [begins, ends])) = inspect(&pair.certificate)
+            // Made by a clock that was wrong, it would count for nobody until then.
+            && begins <= now.as_second()
             && ends - now.as_second() > self.ttl.as_secs().cast_signed() / 3
             && fits(&names)
         {
@@ -254,13 +259,13 @@ fn valid(mut params: CertificateParams, (now, ttl): Term) -> CertificateParams {
     let epoch = rcgen::date_time_ymd(1970, 1, 1);
     let since = |at: i64| epoch + Duration::from_secs(at.max(0).unsigned_abs());
     let seconds = |span: Duration| span.as_secs().cast_signed();
-    params.not_before = since(now.as_second() - seconds(ttl.min(BEFORE)));
+    params.not_before = since(now.as_second() - seconds((ttl / 10).min(BEFORE)));
     params.not_after = since(now.as_second() + seconds(ttl));
     params
 }
 
-/// The alternative names of a certificate and when it ends (seconds since the epoch).
-fn inspect(pem: &str) -> Option<(BTreeSet<String>, i64)> {
+/// The alternative names of a certificate, and when it begins and ends to count (seconds since the epoch).
+fn inspect(pem: &str) -> Option<(BTreeSet<String>, [i64; 2])> {
     let der = CertificateDer::from_pem_slice(pem.as_bytes()).ok()?;
     let (_, certificate) = x509_parser::parse_x509_certificate(&der).ok()?;
     let names = certificate.subject_alternative_name().ok().flatten();
@@ -273,7 +278,8 @@ fn inspect(pem: &str) -> Option<(BTreeSet<String>, i64)> {
             },
             _ => None,
         });
-    Some((names.collect(), certificate.validity().not_after.timestamp()))
+    let term = certificate.validity();
+    Some((names.collect(), [term.not_before, term.not_after].map(|time| time.timestamp())))
 }
 
 fn read_pair(dir: &Path, name: &str) -> Result<Option<Pem>, PkiError> {
@@ -292,16 +298,27 @@ fn read(path: &Path) -> Result<Option<String>, PkiError> {
 }
 
 fn write_pair(dir: &Path, name: &str, pair: &Pem) -> Result<(), PkiError> {
-    // An old certificate beside the new key would be a pair that does not fit.
-    let certificate = dir.join(format!("{name}.crt"));
-    match fs::remove_file(&certificate) {
+    let parts = ["key", "crt"].map(|part| {
+        let path = dir.join(format!("{name}.{part}"));
+        (path.with_added_extension("new"), path)
+    });
+    for ((new, _), text) in parts.iter().zip([&pair.key, &pair.certificate]) {
+        write_private(new, text.as_bytes())?;
+    }
+    // An old certificate beside the new key would be a pair that does not fit. What there is goes when the disk has the new.
+    let [_, (_, certificate)] = &parts;
+    match fs::remove_file(certificate) {
         Err(source) if source.kind() != io::ErrorKind::NotFound => {
-            return Err(PkiError::File { path: certificate, source });
+            return Err(PkiError::File { path: certificate.clone(), source });
         }
         _ => {}
     }
-    write_private(&dir.join(format!("{name}.key")), pair.key.as_bytes())?;
-    write_private(&certificate, pair.certificate.as_bytes())
+    for (new, path) in parts {
+        let failed = |source| PkiError::File { path: path.clone(), source };
+        fs::rename(&new, &path).map_err(failed)?;
+        File::open(dir).and_then(|dir| dir.sync_all()).map_err(failed)?;
+    }
+    Ok(())
 }
 
 /// Writes a file whole or not at all, readable by its owner only.
@@ -362,6 +379,8 @@ mod tests {
         let second = again.admin(at(5)).unwrap();
         assert_ne!(second.certificate, first.certificate);
         assert_eq!(again.admin(at(8)).unwrap().certificate, second.certificate);
+        // A clock that was ahead is right again: what was made by it does not count yet.
+        assert_ne!(again.admin(now()).unwrap().certificate, second.certificate);
 
         let server = |hosts: &[&str]| pki.server(&names(hosts), now()).unwrap().certificate;
         let one = server(&["localhost", "127.0.0.1", "::1"]);

@@ -6,6 +6,8 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::time::Instant;
 
+use base64::Engine as _;
+use base64::engine::general_purpose::STANDARD;
 use http::Request;
 use kube::config::{KubeConfigOptions, Kubeconfig};
 use kube::{Api, Client, Config};
@@ -321,9 +323,14 @@ impl Cluster {
 
     /// TLS with the admin's certificate, for a protocol that is not HTTP.
     pub fn admin_tls(&self, protocol: &[u8]) -> rustls::ClientConfig {
-        let pki = self.dir.path().join("controller").join("pki");
-        let read = |name: &str| fs::read(pki.join(name)).expect("the controller's own files");
-        let (ca, certificate, key) = (read("ca.crt"), read("admin.crt"), read("admin.key"));
+        // Of one file, which is replaced whole.
+        let config = fs::read_to_string(self.kubeconfig()).expect("the controller's own");
+        let read = |field: &str| {
+            let value = config.lines().find_map(|line| line.trim().strip_prefix(field));
+            STANDARD.decode(value.expect(field).trim()).expect("base64")
+        };
+        let ca = read("certificate-authority-data:");
+        let (certificate, key) = (read("client-certificate-data:"), read("client-key-data:"));
         let mut roots = rustls::RootCertStore::empty();
         roots.add(CertificateDer::from_pem_slice(&ca).expect("a CA")).expect("a CA");
         let certificate = CertificateDer::from_pem_slice(&certificate).expect("a certificate");

@@ -137,6 +137,12 @@ impl Credentials {
         Ok(tls::term(&certificate)?)
     }
 
+    /// PEM.
+    pub(crate) fn certificate(&self) -> Result<Vec<u8>, FileError> {
+        let [_, certificate, _] = self.read()?;
+        Ok(certificate)
+    }
+
     /// CA, certificate and key.
     fn read(&self) -> Result<[Vec<u8>; 3], FileError> {
         let read = |name: &str| {
@@ -158,7 +164,7 @@ impl Credentials {
     fn write(&self, key: &str, answer: &JoinAnswer, token: &Token) -> Result<(), FileError> {
         std::fs::create_dir_all(&self.dir).map_err(FileError::at("make", &self.dir))?;
         // Those of an earlier join end first: a key never stands beside another's certificate.
-        for former in [RENEWED, "node.crt"].map(|name| self.dir.join(name)) {
+        for former in ["node.crt", RENEWED].map(|name| self.dir.join(name)) {
             match std::fs::remove_file(&former) {
                 Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
                     return Err(FileError::at("remove", &former)(error));
@@ -202,6 +208,8 @@ pub(crate) async fn renew(
     // One request, and no streams.
     config.alpn_protocols = vec![b"http/1.1".to_vec()];
     let (key, answer) = ask((address, config), None, (node, kind)).await?;
+    // Whatever was answered: what is stored lets this node in.
+    tls::mutual(answer.ca.as_bytes(), answer.certificate.as_bytes(), key.as_bytes())?;
     credentials.renew(key, answer)?;
     Ok(())
 }

@@ -33,11 +33,13 @@ pub(crate) struct Renewal {
     pub(crate) client: watch::Sender<Arc<ClientConfig>>,
     /// The same for those of frameworks.
     pub(crate) server: Option<watch::Sender<Arc<ServerConfig>>>,
+    /// The certificate of both, as it is stored; empty at first.
+    pub(crate) shown: Vec<u8>,
 }
 
 impl Renewal {
     /// Never ends.
-    pub(crate) async fn run(self) {
+    pub(crate) async fn run(mut self) {
         loop {
             let left = match self.look().await {
                 Ok(left) => left,
@@ -52,21 +54,39 @@ impl Renewal {
         }
     }
 
-    /// Renews it if it is due; until when it will be due.
-    async fn look(&self) -> Result<Duration, JoinError> {
-        let due = due(self.credentials.term()?, &self.node);
-        let left = Timestamp::now().duration_until(due);
+    /// Renews it if it is due; how long there is nothing to do.
+    async fn look(&mut self) -> Result<Duration, JoinError> {
+        // Also one that was stored by a look that then failed.
+        self.show()?;
+        let term = self.credentials.term()?;
+        let left = Timestamp::now().duration_until(due(term, &self.node));
         if left.is_positive() {
-            return Ok(left.unsigned_abs());
+            // Machines sleep: looked at some times before it ends, however short its term.
+            let often = term.from.duration_until(term.to).unsigned_abs() / 20;
+            return Ok(left.unsigned_abs().min(often));
         }
         join::renew(&self.address, (&self.node, self.kind), &self.credentials).await?;
-        self.client.send_replace(Arc::new(self.credentials.tls()?));
-        if let (Some(server), Some(config)) = (&self.server, self.credentials.serving(&self.node)?)
+        self.show()?;
+        tracing::info!(until = %self.credentials.term()?.to, "the certificate is renewed");
+        // By a clock that is far ahead the new one is due as well.
+        Ok(self.pause())
+    }
+
+    /// Has connections that begin from now on show what is stored.
+    fn show(&mut self) -> Result<(), JoinError> {
+        let stored = self.credentials.certificate()?;
+        if stored == self.shown {
+            return Ok(());
+        }
+        let client = self.credentials.tls()?;
+        if let Some(server) = &self.server
+            && let Some(config) = self.credentials.serving(&self.node)?
         {
             server.send_replace(Arc::new(config));
         }
-        tracing::info!(until = %self.credentials.term()?.to, "the certificate is renewed");
-        Ok(Duration::ZERO)
+        self.client.send_replace(Arc::new(client));
+        self.shown = stored;
+        Ok(())
     }
 
     /// A tenth of what is left, so that some tries remain.

@@ -21,6 +21,8 @@ pub(super) struct Candidate<'a> {
     pub(super) key: String,
     /// Of the one that it shows, if it is a node's.
     pub(super) shown: Option<&'a str>,
+    /// Of the one by which the present session of the node's began.
+    pub(super) speaking: Option<&'a str>,
 }
 
 /// By what right somebody becomes a node's agent.
@@ -105,8 +107,10 @@ pub(super) async fn enrol(
             return Err(Failure::unauthorized(message));
         }
         let keys = &mut node.status.get_or_insert_default().agent_keys;
-        // The answer to a renewal may get lost, and then the certificate that was shown is all there is.
-        keys.retain(|key| right == Right::Renewal && candidate.shown == Some(key));
+        // The answer to a renewal may get lost, and then the certificate that was shown is all there is; a session goes on by
+        // that of its beginning.
+        let stays = [candidate.shown, candidate.speaking];
+        keys.retain(|key| right == Right::Renewal && stays.contains(&Some(key.as_str())));
         keys.insert(0, candidate.key.clone());
         match context.store.apply_one(objects::replace(&stored, &node)).await {
             Ok(_) => return Ok(()),

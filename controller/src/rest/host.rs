@@ -25,9 +25,19 @@ pub(crate) fn check(asker: &Asker, present: &Value, new: &Value) -> Violations {
         if before.iter().any(|(_, known)| *known == spec) {
             continue;
         }
-        // An object that was let in reads as its kind.
-        let Ok(spec) = TaskSpec::deserialize(spec) else { continue };
-        for reached in host::reached(&spec.run) {
+        let spec = match TaskSpec::deserialize(spec) {
+            Ok(spec) => spec,
+            Err(error) => {
+                violations.invalid(path, error.to_string());
+                continue;
+            }
+        };
+        // What was stored before a field was there says less, and means the same.
+        let known = |known: &Value| TaskSpec::deserialize(known).is_ok_and(|known| known == spec);
+        if before.iter().any(|(_, before)| known(before)) {
+            continue;
+        }
+        for reached in host::reached(&spec) {
             violations
                 .forbidden(format!("{path}.{}", reached.field()), why(asker, namespace, &reached))
                 .suggest(format!("{}, or have `hostAccess` by an Access", reached.instead()));
@@ -46,7 +56,7 @@ pub(super) fn check_entry(asker: &Asker, task: &Task) -> Result<(), Failure> {
     if host::allowed(&asker.who, namespace) {
         return Ok(());
     }
-    match host::reached(&task.spec.run).first() {
+    match host::reached(&task.spec).first() {
         None => Ok(()),
         Some(reached) => Err(Failure::denied(format!(
             "the task reaches into its node (spec.{}): {}; an Access with `hostAccess` lets them in",

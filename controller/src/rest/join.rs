@@ -48,7 +48,10 @@ pub(super) async fn join(call: Call) -> Answer {
         _ => None,
     };
     let (node, kind) = (asked.node_name.as_str(), asked.kind);
-    let candidate = Candidate { node, kind, key: key_of(&certificate)?, shown };
+    let session = context.live().zip(node.parse().ok());
+    let session = session.and_then(|(live, node)| live.sessions.connection(&node));
+    let speaking = session.as_ref().map(|session| &*session.key);
+    let candidate = Candidate { node, kind, key: key_of(&certificate)?, shown, speaking };
     let taken = enrol::check(&context, &candidate)?;
     let right = right(&context, &asked, &asker.identity, taken).await?;
     enrol::enrol(&context, &candidate, right).await?;

@@ -260,6 +260,7 @@ impl Session {
         let logs = Arc::default();
         let connection = Connection {
             id: self.id,
+            key: speaker.key.as_str().into(),
             outbound,
             relay: relay::Relay::default(),
             tickets: to_agent,

@@ -117,6 +117,8 @@ impl From<wire::Link> for Link {
 pub(crate) struct Connection {
     /// Tells this session from a later one of the same node.
     pub(crate) id: u64,
+    /// Of the certificate by which it began.
+    pub(crate) key: Arc<str>,
     /// Messages to the agent, beside its assignments.
     pub(crate) outbound: mpsc::Sender<wire::ControllerMessage>,
     /// Messages of frameworks to its executors.

@@ -58,11 +58,15 @@ pub(super) fn body(launch: &Launch, config: &DockerConfig) -> Result<ContainerCr
         retry: true,
     })?;
     if let Some((uid, gid)) = container.user {
-        std::os::unix::fs::chown(&run_dir, Some(uid), Some(gid)).map_err(|error| Failure {
-            reason: "NodeError".to_owned(),
-            message: format!("failed to hand over {}: {error}", run_dir.display()),
-            retry: true,
-        })?;
+        match std::os::unix::fs::chown(&run_dir, Some(uid), Some(gid)) {
+            // Of an agent that is not root: the program runs, and cannot write there.
+            Err(error) if error.kind() == std::io::ErrorKind::PermissionDenied => {}
+            done => done.map_err(|error| Failure {
+                reason: "NodeError".to_owned(),
+                message: format!("failed to hand over {}: {error}", run_dir.display()),
+                retry: true,
+            })?,
+        }
     }
     let mut env = launch.env.clone();
     env.insert("MUSTER_RUN_DIR".to_owned(), RUN_DIR.to_owned());

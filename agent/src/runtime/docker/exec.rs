@@ -22,7 +22,7 @@ pub(super) fn failed<E: std::error::Error + Send + Sync + 'static>(error: E) -> 
 }
 
 /// How long the engine may take to say which process a program is that is to be killed.
-const KILLED_WITHIN: Duration = Duration::from_secs(10);
+const KILLED_WITHIN: Duration = Duration::from_secs(2);
 
 /// Kills a program with its session. The engine has no word for that: it says which process of this node it is,
 /// as soon as it has started it, and made it the leader of its session.

@@ -309,7 +309,11 @@ impl DockerRuntime {
             match looked {
                 Ok(Some(Seen::Ended(exit))) => {
                     self.wait_empty(id).await;
-                    let exit = self.ended_by_kill(&name, exit).await;
+                    // Without a limit there is no memory that runs out.
+                    let exit = match launch.limits.memory_bytes {
+                        Some(_) => self.ended_by_kill(&name, exit).await,
+                        None => exit,
+                    };
                     self.live().remove(id);
                     return self.ended(id, exit);
                 }

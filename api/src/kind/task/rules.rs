@@ -246,7 +246,7 @@ fn is_numbers(user: &str) -> bool {
     let (uid, gid) = user.split_once(':').unwrap_or((user, "0"));
     [uid, gid]
         .into_iter()
-        .all(|id| id.bytes().all(|b| b.is_ascii_digit()) && id.parse::<u32>().is_ok())
+        .all(|id| id.bytes().all(|b| b.is_ascii_digit()) && id.parse::<i32>().is_ok())
 }
 
 fn absolute(path: &str, given: Option<&str>, violations: &mut Violations) {

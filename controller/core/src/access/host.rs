@@ -8,7 +8,7 @@
 use std::fmt;
 
 use muster_api::kind::access::Role;
-use muster_api::kind::task::{Network, Run};
+use muster_api::kind::task::{Network, TaskSpec};
 
 use super::Who;
 
@@ -26,6 +26,11 @@ pub enum Reached {
     },
     /// What listens on the node's own addresses.
     Network,
+    /// Whatever ROS master the task names, and who publishes there: the agent asks for a topic's rate from where it is itself.
+    Topic {
+        /// Which of the probes.
+        probe: &'static str,
+    },
 }
 
 impl Reached {
@@ -36,6 +41,7 @@ impl Reached {
             Self::Process => "run.process".to_owned(),
             Self::Path { mount, .. } => format!("run.container.mounts[{mount}].hostPath"),
             Self::Network => "run.container.network".to_owned(),
+            Self::Topic { probe } => format!("{probe}.topic"),
         }
     }
 
@@ -46,6 +52,7 @@ impl Reached {
             Self::Process => "run a container",
             Self::Path { .. } => "bring what it needs in the image, in a ConfigMap or in a Secret",
             Self::Network => "say `network: Bridge` or `network: None`",
+            Self::Topic { .. } => "probe by `exec`, `http` or `tcp`",
         }
     }
 }
@@ -56,14 +63,15 @@ impl fmt::Display for Reached {
             Self::Process => f.write_str("a process sees its node's files"),
             Self::Path { path, .. } => write!(f, "{path:?} is its node's"),
             Self::Network => f.write_str("is its node's own, also when nothing is said"),
+            Self::Topic { .. } => f.write_str("is asked for from its node's network"),
         }
     }
 }
 
-/// What a program reaches of its node.
+/// What a task reaches of its node.
 #[must_use]
-pub fn reached(run: &Run) -> Vec<Reached> {
-    let mut all = Vec::new();
+pub fn reached(spec: &TaskSpec) -> Vec<Reached> {
+    let (run, mut all) = (&spec.run, Vec::new());
     if run.process.is_some() {
         all.push(Reached::Process);
     }
@@ -74,6 +82,10 @@ pub fn reached(run: &Run) -> Vec<Reached> {
             all.push(Reached::Network);
         }
     }
+    let probes =
+        [("startup", &spec.startup), ("readiness", &spec.readiness), ("liveness", &spec.liveness)];
+    let topics = probes.into_iter().filter(|(_, p)| p.as_ref().is_some_and(|p| p.topic.is_some()));
+    all.extend(topics.map(|(probe, _)| Reached::Topic { probe }));
     all
 }
 
@@ -98,8 +110,12 @@ mod tests {
     use super::*;
 
     fn reaches(run: serde_json::Value) -> Vec<String> {
-        let run: Run = serde_json::from_value(run).expect("a program");
-        reached(&run).iter().map(Reached::field).collect()
+        reaches_with(json!({ "run": run }))
+    }
+
+    fn reaches_with(spec: serde_json::Value) -> Vec<String> {
+        let spec: TaskSpec = serde_json::from_value(spec).expect("a spec");
+        reached(&spec).iter().map(Reached::field).collect()
     }
 
     #[test]
@@ -129,6 +145,17 @@ mod tests {
             reaches(json!({"executor": {"task": "e"}})),
             [""; 0],
             "it adds nothing to its executor"
+        );
+    }
+
+    #[test]
+    fn a_topic_is_asked_for_by_the_agent() {
+        let run = json!({"container": {"image": "i", "network": "None"}});
+        let topic = json!({"topic": {"name": "/scan", "minHz": 1.0}});
+        let exec = json!({"exec": {"command": ["true"]}});
+        assert_eq!(
+            reaches_with(json!({"run": run, "readiness": topic, "liveness": exec})),
+            ["readiness.topic"]
         );
     }
 

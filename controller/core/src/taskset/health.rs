@@ -140,11 +140,7 @@ pub fn fault(
     now: Timestamp,
 ) -> Option<Fault> {
     use TaskPhase::{Bound, Failed, Pending, Running, Starting, Stopping, Succeeded, Unknown};
-    let crashed = || {
-        // What an attempt that began since says is not how the one before it ended.
-        let how = task.exited.clone().filter(|_| task.message.is_empty());
-        Some(Fault::Crashed { message: how.unwrap_or_else(|| task.message.clone()) })
-    };
+    let crashed = || Some(Fault::Crashed { message: task.message.clone() });
     match task.phase {
         // It is ending, or nobody knows.
         Stopping | Unknown => return None,
@@ -152,7 +148,10 @@ pub fn fault(
         Failed | Succeeded => return crashed(),
         // Back-off follows a crash and a start that failed; an attempt after one that exited, a crash that is over.
         Starting if task.reason == "BackOff" => return crashed(),
-        Starting | Running if task.attempt > 1 && task.exited.is_some() => return crashed(),
+        // What that one says is not how the one before it ended.
+        Starting | Running if task.attempt > 1 && task.exited.is_some() => {
+            return Some(Fault::Crashed { message: task.exited.clone().unwrap_or_default() });
+        }
         Starting | Running | Bound | Pending => {}
     }
     if is_excused(task) || due(task, node, deadline) > now {

@@ -16,8 +16,8 @@ use tokio_tungstenite::tungstenite::handshake::derive_accept_key;
 use tokio_tungstenite::tungstenite::protocol::frame::coding::CloseCode;
 use tokio_tungstenite::tungstenite::protocol::{CloseFrame, Role, WebSocketConfig};
 
-use super::{TerminalSize, Visit, failure, outcome, switching, tell};
-use crate::auth;
+use super::{TerminalSize, Visit, failure, host, outcome, switching, tell};
+use crate::auth::{self, Asker};
 use crate::context::Context;
 use crate::rest::failure::Failure;
 use crate::rest::path::Verb;
@@ -129,6 +129,7 @@ async fn serve(context: &Context, socket: Socket, visit: Visit) {
                     () = auth::until_revoked(context, &visit.who, &asked) => {
                         Failure::denied("the right to enter the task was taken back")
                     }
+                    failure = until_closed(context, &visit) => failure,
                 }
             };
             match relay.run((&mut sink, &mut source), &mut from, over).await {
@@ -148,6 +149,20 @@ async fn serve(context: &Context, socket: Socket, visit: Visit) {
         let closed = async { while let Some(Ok(_)) = source.next().await {} };
         // A client that is slow to close is left to its kernel.
         drop(timeout(CLOSES_WITHIN, closed).await);
+    }
+}
+
+/// Returns when access to hosts was taken back from somebody who is in a task that reaches into its node.
+async fn until_closed(context: &Context, visit: &Visit) -> Failure {
+    if visit.asked.command.is_empty() {
+        return std::future::pending().await;
+    }
+    loop {
+        tokio::time::sleep(auth::LOOK_AGAIN).await;
+        let asker = Asker::with(context, visit.who.clone());
+        if let Err(failure) = host::check_entry(&asker, &visit.task) {
+            return failure;
+        }
     }
 }
 
