@@ -160,8 +160,7 @@ pub async fn start(config: Config) -> Result<Running, AppError> {
     let writer = tokio::spawn(guard(Arc::clone(&context), "writer", writer));
     rest::namespace::bootstrap(&context).await.map_err(AppError::Bootstrap)?;
     let admin = context.pki.admin(now)?;
-    let (file, asked) = (&context.config.kubeconfig, context.config.kubeconfig_asked);
-    kubeconfig::write(file, asked, &context.url(), context.pki.ca(), &admin)?;
+    write_kubeconfig(&context, &admin)?;
 
     let background = TaskTracker::new();
     let shown = tls.subscribe();
@@ -351,6 +350,11 @@ fn names(config: &Config) -> BTreeSet<String> {
     names
 }
 
+fn write_kubeconfig(context: &Context, admin: &Pem) -> Result<(), KubeconfigError> {
+    let (file, asked) = (&context.config.kubeconfig, context.config.kubeconfig_asked);
+    kubeconfig::write(file, asked, &context.url(), context.pki.ca(), admin)
+}
+
 /// What of the controller's own certificates is in use.
 struct Renewal {
     context: Arc<Context>,
@@ -387,9 +391,9 @@ impl Renewal {
         }
         let admin = context.pki.admin(now)?;
         if admin.certificate != self.admin.certificate {
-            let (file, asked) = (&context.config.kubeconfig, context.config.kubeconfig_asked);
-            kubeconfig::write(file, asked, &context.url(), context.pki.ca(), &admin)?;
-            tracing::info!(file = %file.display(), "the administrator's certificate is renewed");
+            write_kubeconfig(context, &admin)?;
+            let file = context.config.kubeconfig.display();
+            tracing::info!(%file, "the administrator's certificate is renewed");
             self.admin = admin;
         }
         Ok(())

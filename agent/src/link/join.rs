@@ -19,7 +19,7 @@ use rustls::{ClientConfig, ServerConfig};
 use serde::{Deserialize, Serialize};
 
 use super::Address;
-use super::tls::{self, ConnectError, Term};
+use super::tls::{self, ConnectError};
 use super::token::Token;
 use crate::config::Kind;
 use crate::durable::{self, FileError, Keep};
@@ -131,13 +131,7 @@ impl Credentials {
         Ok(tls::serving(&ca, &certificate, &key, node)?)
     }
 
-    /// From when to when the certificate counts.
-    pub(crate) fn term(&self) -> Result<Term, JoinError> {
-        let [_, certificate, _] = self.read()?;
-        Ok(tls::term(&certificate)?)
-    }
-
-    /// PEM.
+    /// The certificate, PEM.
     pub(crate) fn certificate(&self) -> Result<Vec<u8>, FileError> {
         let [_, certificate, _] = self.read()?;
         Ok(certificate)

@@ -12,7 +12,7 @@ use tokio::sync::watch;
 
 use super::Address;
 use super::join::{self, Credentials, JoinError};
-use super::tls::{Term, sha256};
+use super::tls::{self, Term, sha256};
 use crate::config::Kind;
 use crate::driver::chain;
 
@@ -58,7 +58,7 @@ impl Renewal {
     async fn look(&mut self) -> Result<Duration, JoinError> {
         // Also one that was stored by a look that then failed.
         self.show()?;
-        let term = self.credentials.term()?;
+        let term = tls::term(&self.shown)?;
         let left = Timestamp::now().duration_until(due(term, &self.node));
         if left.is_positive() {
             // Machines sleep: looked at some times before it ends, however short its term.
@@ -67,7 +67,7 @@ impl Renewal {
         }
         join::renew(&self.address, (&self.node, self.kind), &self.credentials).await?;
         self.show()?;
-        tracing::info!(until = %self.credentials.term()?.to, "the certificate is renewed");
+        tracing::info!(until = %tls::term(&self.shown)?.to, "the certificate is renewed");
         // By a clock that is far ahead the new one is due as well.
         Ok(self.pause())
     }
@@ -91,7 +91,7 @@ impl Renewal {
 
     /// A tenth of what is left, so that some tries remain.
     fn pause(&self) -> Duration {
-        let end = self.credentials.term().map(|term| term.to);
+        let end = tls::term(&self.shown).map(|term| term.to);
         let left = end.map_or(SignedDuration::ZERO, |end| Timestamp::now().duration_until(end));
         let left = if left.is_positive() { left.unsigned_abs() } else { PAUSE.1 * 10 };
         (left / 10).clamp(PAUSE.0, PAUSE.1)

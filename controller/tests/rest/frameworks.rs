@@ -28,11 +28,7 @@ async fn a_framework_is_run_where_its_role_is() {
     let namespace = json!({"apiVersion": "v1", "kind": "Namespace", "metadata": {"name": "lab"}});
     assert_eq!(send(&admin, "POST", "/api/v1/namespaces", namespace).await.0, 201);
     let give = async |role: &str, user: &str| {
-        let access = json!({
-            "apiVersion": "muster.dev/v1alpha1", "kind": "Access", "metadata": {"name": user},
-            "spec": {"role": role, "namespaces": ["lab"], "subjects": [{"name": user}]},
-        });
-        assert_eq!(send(&admin, "POST", &format!("{G}/accesses"), access).await.0, 201);
+        cluster.give(user, role, json!(["lab"])).await;
         cluster.user(user).await
     };
     let courier = give("framework", "courier").await;
@@ -96,11 +92,7 @@ async fn ends(mut body: kube::client::Body) {
 async fn a_session_ends_with_the_token_or_the_right_that_opened_it() {
     let cluster = Cluster::start().await;
     let admin = cluster.admin().await;
-    let access = json!({
-        "apiVersion": "muster.dev/v1alpha1", "kind": "Access", "metadata": {"name": "courier"},
-        "spec": {"role": "framework", "namespaces": ["default"], "subjects": [{"name": "courier"}]},
-    });
-    assert_eq!(send(&admin, "POST", &format!("{G}/accesses"), access).await.0, 201);
+    cluster.give("courier", "framework", json!(["default"])).await;
     let made = cluster.token("courier", 3600).await;
     let courier = cluster.bearer(made["status"]["token"].as_str().unwrap()).await;
     let (_, event, mut session) = subscribe(&courier, "default").await;
@@ -141,11 +133,7 @@ async fn a_session_ends_with_the_token_or_the_right_that_opened_it() {
 async fn a_framework_reaches_into_nodes_only_with_access_to_hosts() {
     let cluster = Cluster::start().await;
     let admin = cluster.admin().await;
-    let access = json!({
-        "apiVersion": "muster.dev/v1alpha1", "kind": "Access", "metadata": {"name": "courier"},
-        "spec": {"role": "framework", "namespaces": ["default"], "subjects": [{"name": "courier"}]},
-    });
-    assert_eq!(send(&admin, "POST", &format!("{G}/accesses"), access).await.0, 201);
+    cluster.give("courier", "framework", json!(["default"])).await;
     let courier = cluster.user("courier").await;
     let (_, event, mut session) = subscribe(&courier, "default").await;
     let id = event["subscribed"]["sessionId"].as_str().unwrap();

@@ -32,12 +32,7 @@ fn fields(answer: &(u16, Value)) -> Vec<&str> {
 }
 
 async fn developer(cluster: &Cluster) -> Client {
-    let access = json!({
-        "apiVersion": "muster.dev/v1alpha1", "kind": "Access", "metadata": {"name": "ada"},
-        "spec": {"role": "developer", "namespaces": ["default"], "subjects": [{"name": "ada"}]},
-    });
-    let admin = cluster.admin().await;
-    assert_eq!(send(&admin, "POST", &format!("{G}/accesses"), access).await.0, 201);
+    cluster.give("ada", "developer", json!(["default"])).await;
     cluster.user("ada").await
 }
 

@@ -32,11 +32,7 @@ async fn fenced(cluster: &Cluster, status: &str) {
 async fn nobody_is_told_that_they_have_a_robot_while_a_task_may_drive_it() {
     let cluster = Cluster::start().await;
     let admin = cluster.admin().await;
-    let access = json!({
-        "apiVersion": "muster.dev/v1alpha1", "kind": "Access", "metadata": {"name": "bob"},
-        "spec": {"role": "operator", "subjects": [{"name": "bob"}]},
-    });
-    assert_eq!(send(&admin, "POST", &format!("{G}/accesses"), access).await.0, 201);
+    cluster.give("bob", "operator", Value::Null).await;
     let bob = cluster.user("bob").await;
     let credential = join(&cluster, "r1").await;
     let mut session = Session::open(&cluster, &credential, Vec::new()).await.unwrap();

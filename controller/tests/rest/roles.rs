@@ -226,13 +226,7 @@ async fn lets(client: &Client, method: &str, path: &str) -> bool {
 
 /// Gives `user` a role, and a client with a token.
 async fn user(cluster: &Cluster, name: &str, role: &str, namespaces: Value) -> Client {
-    let admin = cluster.admin().await;
-    let access = json!({
-        "apiVersion": "muster.dev/v1alpha1", "kind": "Access", "metadata": {"name": name},
-        "spec": {"role": role, "namespaces": namespaces, "subjects": [{"kind": "User", "name": name}]},
-    });
-    let (code, answer) = send(&admin, "POST", &format!("{G}/accesses"), access).await;
-    assert_eq!(code, 201, "{answer}");
+    cluster.give(name, role, namespaces).await;
     cluster.user(name).await
 }
 

@@ -101,6 +101,17 @@ impl Cluster {
         self.bearer(made["status"]["token"].as_str().unwrap()).await
     }
 
+    /// Gives a user a role in these namespaces, or with null in the whole cluster, by an Access of their name.
+    pub(crate) async fn give(&self, user: &str, role: &str, namespaces: Value) {
+        let access = json!({
+            "apiVersion": "muster.dev/v1alpha1", "kind": "Access", "metadata": {"name": user},
+            "spec": {"role": role, "namespaces": namespaces, "subjects": [{"kind": "User", "name": user}]},
+        });
+        let admin = self.admin().await;
+        let (code, answer) = send(&admin, "POST", &format!("{G}/accesses"), access).await;
+        assert_eq!(code, 201, "{answer}");
+    }
+
     /// A client that shows this token.
     pub(crate) async fn bearer(&self, token: &str) -> Client {
         let mut config = self.config().await;

@@ -213,11 +213,7 @@ async fn the_kube_watcher_works_in_both_its_modes() {
 async fn a_watch_ends_with_the_token_or_the_right_that_opened_it() {
     let cluster = Cluster::start().await;
     let admin = cluster.admin().await;
-    let access = json!({
-        "apiVersion": "muster.dev/v1alpha1", "kind": "Access", "metadata": {"name": "ada"},
-        "spec": {"role": "viewer", "subjects": [{"name": "ada"}]},
-    });
-    assert_eq!(send(&admin, "POST", &format!("{G}/accesses"), access).await.0, 201);
+    cluster.give("ada", "viewer", Value::Null).await;
     send(&admin, "POST", EVENTS, event("a")).await;
     let made = cluster.token("ada", 3600).await;
     let client =
