@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::fs::{self, File};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
+use std::sync::Arc;
 use std::time::Instant;
 
 use base64::Engine as _;
@@ -20,6 +21,7 @@ use rustls::pki_types::{CertificateDer, PrivateKeyDer};
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
+use crate::netns::Namespace;
 use crate::{kernel, wait};
 
 const API: &str = "/apis/muster.dev/v1alpha1";
@@ -35,6 +37,9 @@ pub struct Cluster {
     listen: String,
     /// Of the controller, beside those that every test's has.
     flags: Vec<String>,
+    /// The controller's, where a test has said so.
+    env: BTreeMap<String, String>,
+    data_dir: PathBuf,
 }
 
 #[derive(Debug)]
@@ -50,6 +55,12 @@ pub struct AgentOptions {
     pub name: String,
     /// Everything else, as on the command line.
     pub flags: Vec<String>,
+    /// Variables, beside those of the test.
+    pub env: BTreeMap<String, String>,
+    /// Where it keeps its data; none: beside the other agents'.
+    pub data_dir: Option<PathBuf>,
+    /// Whose network it has; none: the caller's.
+    pub namespace: Option<Arc<Namespace>>,
 }
 
 impl AgentOptions {
@@ -64,14 +75,26 @@ impl AgentOptions {
             "--ar-res",
             "base:Drive;arm:Grasp",
         ];
-        AgentOptions { name: name.to_owned(), flags: flags.map(str::to_owned).to_vec() }
+        AgentOptions { flags: flags.map(str::to_owned).to_vec(), ..AgentOptions::bare(name) }
             .flag("--position", &format!("static:{x},{y}"))
+    }
+
+    /// One that says nothing of itself.
+    #[must_use]
+    pub fn bare(name: &str) -> Self {
+        AgentOptions {
+            name: name.to_owned(),
+            flags: Vec::new(),
+            env: BTreeMap::new(),
+            data_dir: None,
+            namespace: None,
+        }
     }
 
     /// A cloud server.
     #[must_use]
     pub fn cloud(name: &str) -> Self {
-        AgentOptions { name: name.to_owned(), flags: Vec::new() }.flag("--kind", "cloud")
+        AgentOptions::bare(name).flag("--kind", "cloud")
     }
 
     /// Adds a flag.
@@ -103,8 +126,10 @@ pub fn example(name: &str) -> PathBuf {
 }
 
 fn built(path: &str, what: &str) -> PathBuf {
-    let test = std::env::current_exe().expect("a test has a path");
-    let profile = test.parent().and_then(Path::parent).expect("tests are in target/PROFILE/deps");
+    let own = std::env::current_exe().expect("whoever runs has a path");
+    let dir = own.parent().expect("a directory");
+    // Tests are in target/PROFILE/deps, what they are about beside that.
+    let profile = if dir.ends_with("deps") { dir.parent().expect("PROFILE") } else { dir };
     let path = profile.join(path);
     assert!(
         path.exists(),
@@ -122,15 +147,22 @@ impl Cluster {
 
     /// The same, with flags of the controller's.
     pub async fn start_with(flags: &[&str]) -> Self {
+        Self::start_at("127.0.0.1:0", flags).await
+    }
+
+    /// The same, at an address of the calling thread's namespace.
+    pub async fn start_at(listen: &str, flags: &[&str]) -> Self {
         // Both TLS providers may be linked in; the one that is meant must be said.
         drop(rustls::crypto::ring::default_provider().install_default());
         let dir = TempDir::with_prefix("muster-test-").expect("a temporary directory");
         let mut cluster = Cluster {
-            dir,
             controller: None,
             agents: BTreeMap::new(),
-            listen: "127.0.0.1:0".to_owned(),
+            listen: listen.to_owned(),
             flags: flags.iter().map(|&flag| flag.to_owned()).collect(),
+            env: BTreeMap::new(),
+            data_dir: dir.path().join("controller"),
+            dir,
         };
         cluster.start_controller().await;
         cluster
@@ -156,6 +188,12 @@ impl Cluster {
             .open(path)
             .expect("a log in the test's directory")
             .into()
+    }
+
+    /// Leaves everything where it is, also when the cluster ends.
+    pub fn keep(&mut self) -> &Path {
+        self.dir.disable_cleanup(true);
+        self.dir.path()
     }
 
     /// What a daemon wrote.
@@ -185,16 +223,33 @@ impl Cluster {
         assert!(self.controller.is_none(), "the controller runs");
         let child = Command::new(binary("muster-controller"))
             .args(["--listen", &self.listen, "--data-dir"])
-            .arg(self.dir.path().join("controller"))
+            .arg(&self.data_dir)
             .arg("--kubeconfig")
             .arg(self.kubeconfig())
             .args(&self.flags)
+            .envs(&self.env)
             .stdin(Stdio::null())
             .stdout(self.log("controller"))
             .stderr(self.log("controller"))
             .spawn()
             .expect("the controller starts");
         self.controller = Some(child);
+    }
+
+    /// Where the controller keeps its data.
+    #[must_use]
+    pub fn data_dir(&self) -> &Path {
+        &self.data_dir
+    }
+
+    /// Where it does from its next start on.
+    pub fn set_data_dir(&mut self, dir: PathBuf) {
+        self.data_dir = dir;
+    }
+
+    /// A variable of the controller's, from its next start on.
+    pub fn set_env(&mut self, name: &str, value: &str) {
+        self.env.insert(name.to_owned(), value.to_owned());
     }
 
     /// Waits until the controller is ready, and gives its address; `None`: it has ended.
@@ -375,15 +430,20 @@ impl Cluster {
         command
             .args(["--join", &format!("https://{}", self.listen), "--name", name])
             .arg("--data-dir")
-            .arg(self.dir.path().join(name))
+            .arg(options.data_dir.unwrap_or_else(|| self.dir.path().join(name)))
             .args(&options.flags)
+            .envs(&options.env)
             .stdin(Stdio::null())
             .stdout(self.log(name))
             .stderr(self.log(name));
         if let Some(token) = token {
             command.args(["--token", token]);
         }
-        let child = command.spawn().expect("the agent starts");
+        let child = match options.namespace {
+            Some(namespace) => namespace.run(move || command.spawn()),
+            None => command.spawn(),
+        };
+        let child = child.expect("the agent starts");
         self.agents.get_mut(name).expect("known").process = Some(child);
     }
 
@@ -485,25 +545,32 @@ impl Drop for Cluster {
             drop(child.kill());
             drop(child.wait());
         }
-        // Tasks outlive their agents by design. Shims carry the data directory in their arguments,
-        // tasks in their environment.
-        let dir = self.dir.path().display().to_string();
-        let tasks = fs::read_dir("/proc")
-            .into_iter()
-            .flatten()
-            .flatten()
-            .filter_map(|e| e.file_name().to_str()?.parse::<u32>().ok());
-        let in_environment = tasks.filter(|pid| {
-            fs::read(format!("/proc/{pid}/environ"))
-                .is_ok_and(|e| String::from_utf8_lossy(&e).contains(&dir))
-        });
-        for pid in kernel::with_command(&dir).into_iter().chain(in_environment) {
-            kernel::kill(pid);
+        // Tasks outlive their agents by design.
+        let own = [self.dir.path().to_owned()].into_iter();
+        let elsewhere = self.agents.values().filter_map(|agent| agent.options.data_dir.clone());
+        for dir in own.chain(elsewhere) {
+            end_all(&dir.display().to_string());
         }
         if std::thread::panicking() {
             for name in ["controller"].into_iter().chain(self.agents.keys().map(String::as_str)) {
                 eprintln!("--- {name} ---\n{}", self.log_of(name));
             }
         }
+    }
+}
+
+/// Ends what names this directory: shims in their arguments, tasks in their environment.
+fn end_all(dir: &str) {
+    let tasks = fs::read_dir("/proc")
+        .into_iter()
+        .flatten()
+        .flatten()
+        .filter_map(|e| e.file_name().to_str()?.parse::<u32>().ok());
+    let in_environment = tasks.filter(|pid| {
+        fs::read(format!("/proc/{pid}/environ"))
+            .is_ok_and(|e| String::from_utf8_lossy(&e).contains(dir))
+    });
+    for pid in kernel::with_command(dir).into_iter().chain(in_environment) {
+        kernel::kill(pid);
     }
 }

@@ -11,6 +11,7 @@
 //! | [`docker`] | an image without a registry |
 //! | [`registry`] | a registry of images on loopback |
 //! | [`kernel`] | what the kernel says: processes, start times, cgroups |
+//! | [`netns`], [`wire`] | network namespaces, and wires between them with delay, losses, a rate and cuts |
 //!
 //! A missing piece (a binary, root, Docker) fails the test that needs it; nothing is skipped.
 
@@ -18,10 +19,12 @@ pub mod cluster;
 pub mod docker;
 pub mod echo;
 pub mod kernel;
+pub mod netns;
 pub mod puppet;
 pub mod registry;
 pub mod ros;
 pub mod wait;
+pub mod wire;
 
 pub use cluster::{AgentOptions, Cluster};
 pub use echo::Echo;

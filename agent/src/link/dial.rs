@@ -1,5 +1,6 @@
 //! A connection to the controller: one for the session, and one for each stream that must not hold it up.
 
+use std::hash::{BuildHasher as _, Hasher as _, RandomState};
 use std::net::{IpAddr, SocketAddr};
 use std::sync::{Arc, OnceLock};
 use std::time::Duration;
@@ -28,7 +29,7 @@ pub(crate) mod service {
 
 /// First and longest pause between two tries. The first is short, because a controller that is
 /// started anew is back within seconds; the longest bounds how long a robot is alone for nothing.
-const PAUSE: (Duration, Duration) = (Duration::from_millis(50), Duration::from_secs(5));
+const PAUSE: (Duration, Duration) = (Duration::from_millis(50), Duration::from_secs(2));
 
 /// A connection on which nothing was heard for this long is given up.
 pub(crate) const DEAF_AFTER: Duration = Duration::from_secs(10);
@@ -54,8 +55,15 @@ impl Pauses {
         if begun.elapsed() > PAUSE.1 {
             self.0 = PAUSE.0;
         }
-        tokio::time::sleep(self.0).await;
+        tokio::time::sleep(self.spread()).await;
         self.0 = (self.0 * 2).min(PAUSE.1);
+    }
+
+    /// This pause, up to a half shorter: agents that lost the same controller come back one by one.
+    fn spread(&self) -> Duration {
+        let drawn = RandomState::new().build_hasher().finish();
+        let shorter = (drawn >> 11) as f64 / (1_u64 << 53) as f64 / 2.0;
+        self.0.mul_f64(1.0 - shorter)
     }
 }
 

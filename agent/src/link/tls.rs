@@ -1,6 +1,8 @@
 //! Whom the agent believes, and who it says it is. TLS 1.3 only.
 
+use std::io;
 use std::sync::Arc;
+use std::time::Duration;
 
 use jiff::Timestamp;
 use muster_api::direct::{ALPN, server_name};
@@ -21,6 +23,10 @@ use tokio_rustls::TlsConnector;
 use tokio_rustls::client::TlsStream;
 
 use super::Address;
+
+/// A machine that is there answers a first packet by then. The kernel sends it again after 1, 3, 7 s: who has just come back
+/// from behind a wall should not wait for the next of those.
+const ANSWERS_WITHIN: Duration = Duration::from_secs(2);
 
 /// Why there is no connection.
 #[derive(Debug, thiserror::Error)]
@@ -164,7 +170,7 @@ pub(crate) async fn connect(
 ) -> Result<TlsStream<BufReader<TcpStream>>, ConnectError> {
     let host = ServerName::try_from(address.host.clone())
         .map_err(|_| ConnectError::Host(address.host.clone()))?;
-    let tcp = TcpStream::connect((address.host.as_str(), address.port))
+    let tcp = reach(address)
         .await
         .map_err(|source| ConnectError::Tcp { address: address.to_string(), source })?;
     // Reports and heartbeats are small, and somebody waits for each.
@@ -173,6 +179,19 @@ pub(crate) async fn connect(
         .connect(host, BufReader::with_capacity(READ_BUFFER, tcp))
         .await
         .map_err(|source| ConnectError::Tls { address: address.to_string(), source })
+}
+
+/// The first of the host's addresses that answers.
+async fn reach(address: &Address) -> io::Result<TcpStream> {
+    let mut failed = io::Error::new(io::ErrorKind::NotFound, "the name has no address");
+    for found in tokio::net::lookup_host((address.host.as_str(), address.port)).await? {
+        match tokio::time::timeout(ANSWERS_WITHIN, TcpStream::connect(found)).await {
+            Ok(Ok(tcp)) => return Ok(tcp),
+            Ok(Err(error)) => failed = error,
+            Err(_) => failed = io::ErrorKind::TimedOut.into(),
+        }
+    }
+    Err(failed)
 }
 
 /// SHA-256.

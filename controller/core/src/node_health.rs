@@ -23,6 +23,8 @@ pub struct NodeHealth {
     heard: BTreeMap<NodeName, Monotonic>,
     /// The same, by time: the first is the next to be lost.
     by_time: BTreeSet<(Monotonic, NodeName)>,
+    /// When those that are lost were heard last.
+    lost: BTreeMap<NodeName, Monotonic>,
     detect_after: Duration,
 }
 
@@ -35,6 +37,7 @@ impl NodeHealth {
 
     /// A node was heard at `now`. True: it was not known or lost before, so it is back.
     pub fn heard(&mut self, node: &NodeName, now: Monotonic) -> bool {
+        self.lost.remove(node);
         let before = self.heard.insert(node.clone(), now);
         if let Some(before) = before {
             self.by_time.remove(&(before, node.clone()));
@@ -53,6 +56,7 @@ impl NodeHealth {
 
     /// A node does not exist any more.
     pub fn forget(&mut self, node: &NodeName) {
+        self.lost.remove(node);
         if let Some(before) = self.heard.remove(node) {
             self.by_time.remove(&(before, node.clone()));
         }
@@ -62,6 +66,14 @@ impl NodeHealth {
     #[must_use]
     pub fn is_alive(&self, node: &NodeName) -> bool {
         self.heard.contains_key(node)
+    }
+
+    /// For how long a node surely has not been heard. Of one that was not heard since the process started nothing else is
+    /// known.
+    #[must_use]
+    pub fn silence(&self, node: &NodeName, now: Monotonic) -> Duration {
+        let heard = self.heard.get(node).or_else(|| self.lost.get(node));
+        now.saturating_sub(heard.copied().unwrap_or_default())
     }
 
     /// Nodes that are lost as of `now`, each with how long nothing was heard of it. They are told once.
@@ -74,6 +86,7 @@ impl NodeHealth {
                 break;
             }
             self.forget(&node);
+            self.lost.insert(node.clone(), at);
             lost.push((node, silence));
         }
         lost
@@ -101,10 +114,24 @@ mod tests {
         assert_eq!(health.lost(ms(2499)), []);
         assert_eq!(health.lost(ms(2500)), [(b.clone(), ms(2000))]);
         assert_eq!(health.lost(ms(2500)), []);
+        assert_eq!([&a, &b].map(|node| health.silence(node, ms(2501))), [ms(1901), ms(2001)]);
         assert!(health.is_alive(&a) && !health.is_alive(&b));
         assert!(health.heard(&b, ms(2550)), "it is back");
         health.forget(&b);
         assert_eq!(health.lost(ms(9000)), [(a, ms(8400))]);
         assert_eq!(health.next_deadline(), None);
+    }
+    #[test]
+    fn nobody_is_silent_for_longer_than_the_controller_can_know() {
+        let ms = Duration::from_millis;
+        let (a, b) = (NodeName::new("a").expect("a name"), NodeName::new("b").expect("a name"));
+        let mut health = NodeHealth::new(ms(2000));
+        // Before a restart it was ready.
+        health.presume(&a, ms(3010));
+        assert_eq!([&a, &b].map(|node| health.silence(node, ms(1000))), [ms(0), ms(1000)]);
+        assert_eq!(health.lost(ms(5010)).len(), 1);
+        assert_eq!(health.silence(&a, ms(6000)), ms(2990));
+        health.forget(&a);
+        assert_eq!(health.silence(&a, ms(6000)), ms(6000));
     }
 }

@@ -43,7 +43,7 @@ pub async fn run(context: Arc<Context>, sessions: Arc<Sessions>) {
                 marked.look(&context, &sessions).await;
                 continue;
             }
-            // Somebody was heard for the first time: there is a deadline now.
+            // The first deadline is another one now.
             () = sessions.health_changed() => continue,
         }
         // This process stood still, or the machine: what agents said meanwhile lies in their sockets, and is read first.

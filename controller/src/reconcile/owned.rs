@@ -1,12 +1,15 @@
 //! What an object controls: tasks and the like that are made with its name on them, in the transaction that writes its own
 //! status; and when it is looked at again.
 
+use std::collections::BTreeMap;
 use std::time::Duration;
 
 use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::{ObjectMeta, OwnerReference};
+use muster_api::name::NodeName;
 use muster_controller_core::owner;
 use serde::Deserialize;
+use tokio::time::Instant;
 
 use crate::context::Context;
 use crate::objects;
@@ -14,6 +17,9 @@ use crate::quota::Pass;
 use crate::rest::create::{pass, prepare_object};
 use crate::rest::failure::Failure;
 use crate::store::{Key, Op, Precondition, Stored};
+
+/// Whoever waits for longer is looked at once more in between.
+const LONGEST: Duration = Duration::from_secs(24 * 3600);
 
 /// When an object that controls others is looked at again.
 #[derive(Debug)]
@@ -26,19 +32,51 @@ pub(super) enum Next {
     Again,
 }
 
-/// Until one is due; at once while one is to be looked at again.
-pub(super) async fn sleep_until(context: &Context, is_dirty: bool, when: Option<Timestamp>) {
-    if is_dirty {
-        // What made the last look fail arrives as an event; it should come first.
-        return tokio::task::yield_now().await;
+/// Objects that are looked at again later, whatever happens to dates meanwhile.
+#[derive(Debug, Default)]
+pub(super) struct Later(BTreeMap<Key, Instant>);
+
+impl Later {
+    /// This one at `when`, by the date that is `now`.
+    pub(super) fn insert(&mut self, key: Key, when: Timestamp, now: Timestamp) {
+        let wait = Duration::try_from(when.duration_since(now)).unwrap_or_default();
+        self.0.insert(key, Instant::now() + wait.min(LONGEST));
     }
-    match when {
-        Some(when) => {
-            let left = when.duration_since(context.clock.now());
-            tokio::time::sleep(Duration::try_from(left).unwrap_or_default()).await;
+
+    /// This one is looked at now.
+    pub(super) fn remove(&mut self, key: &Key) {
+        self.0.remove(key);
+    }
+
+    pub(super) fn keys(&self) -> impl Iterator<Item = &Key> {
+        self.0.keys()
+    }
+
+    /// Those whose time has come.
+    pub(super) fn due(&self) -> impl Iterator<Item = &Key> {
+        let now = Instant::now();
+        self.0.iter().filter(move |(_, when)| **when <= now).map(|(key, _)| key)
+    }
+
+    /// Until one is due; at once while one is to be looked at again. Cancel safe.
+    pub(super) fn next(&self, is_dirty: bool) -> impl Future<Output = ()> + use<> {
+        let when = self.0.values().min().copied();
+        async move {
+            match when {
+                // What made the last look fail arrives as an event; it should come first.
+                _ if is_dirty => tokio::task::yield_now().await,
+                Some(when) => tokio::time::sleep_until(when).await,
+                None => std::future::pending().await,
+            }
         }
-        None => std::future::pending().await,
     }
+}
+
+/// When a silent node was heard last, counted back from `now` by a clock that dates do not move; none: nobody measures it.
+pub(super) fn silence(context: &Context, node: &str, now: Timestamp) -> Option<Timestamp> {
+    let node = NodeName::new(node).ok()?;
+    let silence = context.live()?.sessions.silence_of(&node);
+    Some(now.checked_sub(silence).unwrap_or(now))
 }
 
 /// The part of an object that says whose it is.

@@ -50,6 +50,7 @@ pub(super) fn outcome(context: &Context, object: &Value) -> Result<(Value, Vec<D
         revisions: &there.revisions,
         tasks: &there.tasks,
         nodes: &there.nodes,
+        silent: const { &BTreeMap::new() },
         taken: &there.taken,
     };
     let plan = plan(&snapshot, context.clock.now());

@@ -191,8 +191,11 @@ impl Sessions {
 
     /// A heartbeat came. True: the node had been silent, or was never heard.
     pub fn heard(&self, node: &NodeName) -> bool {
-        let back = lock(&self.health).heard(node, self.now());
-        if back {
+        let mut health = lock(&self.health);
+        let before = health.next_deadline();
+        let back = health.heard(node, self.now());
+        // Somebody waits for the first deadline. One that was presumed to be there may be silent earlier than presumed.
+        if before.is_none_or(|before| health.next_deadline() < Some(before)) {
             self.health_changed.notify_one();
         }
         back
@@ -213,6 +216,12 @@ impl Sessions {
     /// Nodes that fell silent since the last call, and for how long.
     pub fn silent_nodes(&self) -> Vec<(NodeName, Duration)> {
         lock(&self.health).lost(self.now())
+    }
+
+    /// For how long a node surely has not been heard, whatever dates say.
+    #[must_use]
+    pub fn silence_of(&self, node: &NodeName) -> Duration {
+        lock(&self.health).silence(node, self.now())
     }
 
     /// When a node can next count as silent.

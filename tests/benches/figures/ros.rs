@@ -22,10 +22,8 @@ const SPAN: Duration = Duration::from_secs(30);
 
 pub(crate) async fn pose() {
     let (ros, mut cluster) = (Ros::start().await, Cluster::start().await);
-    let options = AgentOptions {
-        name: "rover".to_owned(),
-        flags: ["--kind", "robot", "--position", "ros1:/odom"].map(str::to_owned).to_vec(),
-    };
+    let options =
+        AgentOptions::bare("rover").flag("--kind", "robot").flag("--position", "ros1:/odom");
     cluster.join(options.flag("--ros-master", &ros.master()).flag("--ros-host", "127.0.0.1")).await;
     let mut driver = ros.script("odometry.py", &["odometry", "/odom", "30"]);
     driver.line_with("drives").await;

@@ -189,7 +189,7 @@ async fn a_simulated_robot_is_driven_seen_and_stopped() {
 async fn a_task_maps_the_lab_by_the_simulated_laser() {
     let mut cluster = Cluster::start().await;
     let lab = concat!(env!("CARGO_MANIFEST_DIR"), "/../manifests/lab");
-    let options = AgentOptions { name: "robot".to_owned(), flags: Vec::new() };
+    let options = AgentOptions::bare("robot");
     let config = std::fs::read_to_string(format!("{lab}/agent.yaml")).expect("of the tree");
     let config = config
         .replace("name: sim-1", "name: robot")

@@ -71,6 +71,8 @@ pub struct Snapshot<'a> {
     pub tasks: &'a [TaskView],
     /// The nodes by name.
     pub nodes: &'a BTreeMap<String, NodeView>,
+    /// When those that are silent were heard last by a clock that dates do not move, where such a one is at hand.
+    pub silent: &'a BTreeMap<String, Timestamp>,
     /// Names that begin as the set's tasks' do and that others have.
     pub taken: &'a BTreeSet<String>,
 }

@@ -42,6 +42,7 @@ pub struct Crew<'a> {
     /// Those that ended by themselves.
     pub(super) ended: Vec<Member<'a>>,
     nodes: &'a BTreeMap<String, NodeView>,
+    silent: &'a BTreeMap<String, Timestamp>,
     pub(super) look_again: Option<Timestamp>,
 }
 
@@ -77,6 +78,7 @@ impl<'a> Crew<'a> {
             ending: Vec::new(),
             ended: Vec::new(),
             nodes,
+            silent: snapshot.silent,
             look_again: None,
         };
         let min_ready = Duration::from_secs(spec.min_ready_seconds.into());
@@ -108,7 +110,7 @@ impl<'a> Crew<'a> {
         if !replace || task.ending || task.phase != TaskPhase::Unknown {
             return false;
         }
-        let Some(since) = self.node(task).and_then(|n| n.silent_since) else { return false };
+        let Some(since) = self.silent_since(task) else { return false };
         let asked = spec.on_unreachable.after.unwrap_or(DEFAULT_REPLACE_AFTER).as_duration();
         let surely = task.stop_after.map(|stop| stop.saturating_add(STOP_MARGIN));
         let due = after(since, asked.max(surely.unwrap_or_default()));
@@ -116,6 +118,13 @@ impl<'a> Crew<'a> {
             self.look_at(due);
         }
         due <= now
+    }
+
+    /// When a task's node was heard last; none: it is heard.
+    pub(super) fn silent_since(&self, task: &TaskView) -> Option<Timestamp> {
+        let place = task.place().or(task.prefer.as_deref())?;
+        let since = self.node_named(place)?.silent_since?;
+        Some(self.silent.get(place).copied().unwrap_or(since))
     }
 
     /// The node that a task is on, waits for, or had.

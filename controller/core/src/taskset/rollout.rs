@@ -243,7 +243,7 @@ fn is_settled(
         let is_new = task.revision == course.target;
         let is_done = match task.phase {
             TaskPhase::Unknown => {
-                let since = crew.node(task).and_then(|n| n.silent_since).unwrap_or(now);
+                let since = crew.silent_since(task).unwrap_or(now);
                 plan.look_at(Some(after(since, deadline)).filter(|due| *due > now));
                 after(since, deadline) <= now
             }

@@ -138,7 +138,7 @@ pub struct NodeView {
     pub facts: NodeFacts,
     /// The mission that it is on.
     pub lock: Option<MissionLock>,
-    /// Since when its agent is not heard.
+    /// When its agent was heard last; none: it is heard.
     pub silent_since: Option<Timestamp>,
     /// Since when it is ready.
     pub ready_since: Option<Timestamp>,
@@ -155,6 +155,8 @@ impl NodeView {
             let condition = ready.filter(|c| c.status == status);
             condition.and_then(|c| c.last_transition_time.as_ref()).map(|t| t.0)
         };
+        let seen = node.status.as_ref().and_then(|s| s.last_seen.as_ref()).map(|seen| seen.0);
+        let silent_since = since(ConditionStatus::Unknown).map(|since| seen.unwrap_or(since));
         let mut facts = NodeFacts::of(node);
         // Where it is and how full its battery is move all the time, and no set asks for them.
         (facts.pose, facts.battery) = (None, None);
@@ -162,7 +164,7 @@ impl NodeView {
         NodeView {
             facts,
             lock: node.mission_lock(),
-            silent_since: since(ConditionStatus::Unknown),
+            silent_since,
             ready_since: since(ConditionStatus::True),
             images: node.status.as_ref().map(|s| s.images.clone()).unwrap_or_default(),
         }

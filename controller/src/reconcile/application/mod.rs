@@ -22,7 +22,7 @@ use muster_api::kind::task::Task;
 use muster_controller_core::offload::run::view::TaskSeen;
 use muster_controller_core::offload::run::{Snapshot, plan};
 
-use super::owned::{Next, as_owner, sleep_until};
+use super::owned::{Later, Next, as_owner};
 use super::{again, next_events, watch_from_now};
 use crate::context::Context;
 use crate::objects::{self, APPLICATIONS, TASKS};
@@ -47,30 +47,26 @@ async fn follow(context: &Context) -> Result<(), StoreError> {
     for stored in context.store.list(APPLICATIONS, None).items {
         seen.take_in(Change::Put, &stored);
     }
-    let mut later: BTreeMap<Key, Timestamp> = BTreeMap::new();
+    let mut waiting = Later::default();
     loop {
         seen.fill_nodes(context);
         for key in seen.take_dirty() {
-            later.remove(&key);
+            waiting.remove(&key);
             match look(context, &seen, &key).await? {
                 Next::Nothing => {}
-                Next::At(when) => drop(later.insert(key, when)),
+                Next::At(when) => waiting.insert(key, when, context.clock.now()),
                 Next::Again => seen.mark(key),
             }
         }
         tokio::time::sleep(PAUSE).await;
-        let wait = sleep_until(context, seen.is_dirty(), later.values().min().copied());
+        let wait = waiting.next(seen.is_dirty());
         tokio::select! {
             // Cancel safe: events that were not returned are returned by the next call.
             events = next_events(&mut watcher) => {
                 let Some(events) = events else { return Ok(()) };
                 events.iter().for_each(|event| seen.take_in(event.change, &event.object));
             }
-            () = wait => {
-                let now = context.clock.now();
-                let due = later.iter().filter(|(_, when)| **when <= now);
-                due.for_each(|(key, _)| seen.mark(key.clone()));
-            }
+            () = wait => waiting.due().for_each(|key| seen.mark(key.clone())),
         }
     }
 }
@@ -85,7 +81,7 @@ async fn look(context: &Context, seen: &Seen, key: &Key) -> Result<Next, StoreEr
     let now = context.clock.now();
     let nothing = ApplicationStatus::default();
     let status = application.status.as_ref().unwrap_or(&nothing);
-    let nodes = seen.nodes_of(context, &application);
+    let nodes = seen.nodes_of(context, &application, now);
     let tasks = seen::measured(context, tasks(context, &stored, status), now);
     let mut refused = BTreeMap::new();
     // What is refused is left out of the next plan; there are fewer new tasks than parts, so it ends.

@@ -13,7 +13,7 @@ use muster_controller_core::offload::run::view::{NodeSeen, TaskSeen};
 
 use crate::context::Context;
 use crate::objects::{self, APPLICATIONS, NODES, QUOTAS, TASKS};
-use crate::reconcile::owned::Whose;
+use crate::reconcile::owned::{Whose, silence};
 use crate::store::{Change, Key, Stored};
 
 /// How long an attempt must have run before its mean use of cpu says something: starting is not what it does later.
@@ -94,6 +94,7 @@ impl Seen {
         &self,
         context: &Context,
         application: &Application,
+        now: Timestamp,
     ) -> BTreeMap<String, NodeSeen> {
         let spec = &application.spec;
         let parts = application.status.iter().flat_map(|status| &status.parts);
@@ -108,6 +109,9 @@ impl Seen {
             all.map(|(name, node)| (name.clone(), node.clone())).collect();
         let Some(live) = context.live() else { return nodes };
         for (name, node) in &mut nodes {
+            if node.view.silent_since.is_some() {
+                node.view.silent_since = silence(context, name, now);
+            }
             let Ok(name) = NodeName::new(name.clone()) else { continue };
             if let Some(link) = live.sessions.link(&name) {
                 node.link.round_trip = Some(link.round_trip);

@@ -32,6 +32,8 @@ pub(super) struct Index {
     loose: BTreeMap<Key, Labels>,
     /// Kept only while there are sets, whom alone they concern: ten thousand of them are tens of megabytes.
     nodes: Option<BTreeMap<String, NodeView>>,
+    /// Those of them that are not heard.
+    silent: BTreeSet<String>,
     dirty: BTreeSet<Key>,
 }
 
@@ -108,6 +110,7 @@ impl Index {
     /// already, or what is known for a moment more.
     pub(super) fn take_in_nodes<'a>(&mut self, all: impl IntoIterator<Item = &'a Arc<Stored>>) {
         self.nodes = Some(BTreeMap::new());
+        self.silent.clear();
         all.into_iter().for_each(|stored| self.take_in_node(Change::Put, stored));
     }
 
@@ -119,6 +122,11 @@ impl Index {
         // Nodes are written with every placement; few of those changes concern a set.
         if nodes.get(&name) == view.as_ref() {
             return;
+        }
+        if view.as_ref().is_some_and(|view| view.silent_since.is_some()) {
+            self.silent.insert(name.clone());
+        } else {
+            self.silent.remove(&name);
         }
         match view {
             Some(view) => drop(nodes.insert(name, view)),
@@ -158,6 +166,11 @@ impl Index {
     pub(super) fn nodes(&self) -> &BTreeMap<String, NodeView> {
         const NONE: &BTreeMap<String, NodeView> = &BTreeMap::new();
         self.nodes.as_ref().unwrap_or(NONE)
+    }
+
+    /// Nodes that are not heard.
+    pub(super) fn silent(&self) -> &BTreeSet<String> {
+        &self.silent
     }
 
     /// The tasks of a set, and those that it could take in, in the order of their names.

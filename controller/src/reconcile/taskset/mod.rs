@@ -12,7 +12,7 @@
 mod index;
 mod write;
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -24,7 +24,7 @@ use muster_api::kind::taskset_revision::TaskSetRevision;
 use muster_controller_core::taskset::view::{RevisionView, TaskView};
 use muster_controller_core::taskset::{Snapshot, plan};
 
-use super::owned::{Next, as_owner, sleep_until};
+use super::owned::{Later, Next, as_owner, silence};
 use super::{again, next_events, watch_from_now};
 use crate::context::Context;
 use crate::objects::{self, NODES, QUOTAS, REVISIONS};
@@ -51,7 +51,7 @@ async fn follow(context: &Context) -> Result<(), StoreError> {
     for stored in context.store.list_all() {
         index.take_in(Change::Put, &stored);
     }
-    let mut later: BTreeMap<Key, Timestamp> = BTreeMap::new();
+    let mut later = Later::default();
     loop {
         if index.lacks_nodes() {
             index.take_in_nodes(&context.store.list(NODES, None).items);
@@ -60,11 +60,11 @@ async fn follow(context: &Context) -> Result<(), StoreError> {
             later.remove(&key);
             match look(context, &index, &key).await? {
                 Next::Nothing => {}
-                Next::At(when) => drop(later.insert(key, when)),
+                Next::At(when) => later.insert(key, when, context.clock.now()),
                 Next::Again => index.mark(key),
             }
         }
-        let wait = sleep_until(context, index.is_dirty(), later.values().min().copied());
+        let wait = later.next(index.is_dirty());
         tokio::select! {
             // Cancel safe: events that were not returned are returned by the next call.
             events = next_events(&mut watcher) => {
@@ -79,12 +79,7 @@ async fn follow(context: &Context) -> Result<(), StoreError> {
                     }
                 }
             }
-            () = wait => {
-                let now = context.clock.now();
-                let due: BTreeSet<Key> =
-                    later.iter().filter(|(_, when)| **when <= now).map(|(key, _)| key.clone()).collect();
-                due.into_iter().for_each(|key| index.mark(key));
-            }
+            () = wait => later.due().for_each(|key| index.mark(key.clone())),
         }
     }
 }
@@ -108,6 +103,7 @@ async fn look(context: &Context, index: &Index, key: &Key) -> Result<Next, Store
         revisions: &revisions,
         tasks: &tasks,
         nodes: index.nodes(),
+        silent: &silent_since(context, index, now),
         taken: &index.names(key, &tasks, |other| context.store.get(other).is_some()),
     };
     let mut plan = plan(&snapshot, now);
@@ -124,6 +120,12 @@ async fn look(context: &Context, index: &Index, key: &Key) -> Result<Next, Store
             Next::At(now.checked_add(LATER).unwrap_or(now))
         }
     })
+}
+
+/// When silent nodes were heard last: dates may have jumped since.
+fn silent_since(context: &Context, index: &Index, now: Timestamp) -> BTreeMap<String, Timestamp> {
+    let since = |name: &String| Some((name.clone(), silence(context, name, now)?));
+    index.silent().iter().filter_map(since).collect()
 }
 
 fn revisions(context: &Context, set: &Stored, name: &str) -> Vec<RevisionView> {

@@ -8,7 +8,6 @@ use muster_api::kind::node::{NodeKind, Taint, TaintEffect};
 
 use super::Snapshot;
 use super::view::NodeSeen;
-use crate::node_health::DETECT_AFTER;
 use crate::offload::view::{LinkView, ScaleView};
 use crate::taskset::after;
 
@@ -110,7 +109,7 @@ fn unfit(spec: &ApplicationSpec, node: &NodeSeen, now: Timestamp) -> Option<Stri
         return Some(format!("it is out of service for now: {}", taint.key));
     }
     let not_ready = facts.not_ready.as_ref()?;
-    let Some(silent) = silent_since(node) else {
+    let Some(silent) = node.view.silent_since else {
         return Some(format!("it is not ready: {not_ready}"));
     };
     let tolerated = spec.connections.iter().filter(|c| c.min_hz.is_some()).map(|c| c.tolerance);
@@ -119,19 +118,11 @@ fn unfit(spec: &ApplicationSpec, node: &NodeSeen, now: Timestamp) -> Option<Stri
     (given_up <= now).then(|| format!("it is not heard since {silent}"))
 }
 
-/// When a silent node was heard last, by the controller's clock.
-fn silent_since(node: &NodeSeen) -> Option<Timestamp> {
-    node.view.silent_since.map(|seen| {
-        let detected = jiff::SignedDuration::try_from(DETECT_AFTER).unwrap_or_default();
-        seen.checked_sub(detected).unwrap_or(seen)
-    })
-}
-
 fn link(node: Option<&NodeSeen>, now: Timestamp) -> LinkView {
     let up = node.is_some_and(|node| node.view.facts.not_ready.is_none());
     let since = match node {
         Some(node) if up => node.view.ready_since,
-        Some(node) => silent_since(node),
+        Some(node) => node.view.silent_since,
         None => None,
     };
     let measured = node.map(|node| node.link).unwrap_or_default();

@@ -164,6 +164,7 @@ impl World {
             revisions: &self.revisions,
             tasks: &self.tasks,
             nodes: &self.nodes,
+            silent: const { &BTreeMap::new() },
             taken: &self.taken,
         };
         plan(&snapshot, self.now)

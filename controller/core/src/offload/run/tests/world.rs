@@ -237,7 +237,7 @@ impl World {
             let node = self.nodes.get_mut(name).expect("a node");
             if node.view.silent_since.is_none() && now.duration_since(*since) >= DETECTED {
                 node.view.facts.not_ready = Some("silent".to_owned());
-                (node.view.silent_since, node.view.ready_since) = (Some(now), None);
+                (node.view.silent_since, node.view.ready_since) = (Some(*since), None);
             }
         }
         for (name, real) in &mut self.real {
