@@ -111,6 +111,13 @@ impl Board {
         })
     }
 
+    /// Resolves when nothing is only remembered of the tasks of an earlier life of the agent.
+    pub(crate) async fn known(&self) {
+        let mut news = self.news();
+        // Closed: the agent goes down.
+        while !self.entries().values().all(|entry| entry.known) && news.changed().await.is_ok() {}
+    }
+
     pub(crate) fn acknowledged(&self, uid: &str, sequence: u64) {
         if let Some(entry) = self.entries().get_mut(uid) {
             entry.acked = entry.acked.max(sequence);

@@ -212,7 +212,10 @@ fn containers_outlive_the_agent() {
     std::fs::write(agent.task_dir("d-end").join("run/go"), "").unwrap();
     until("the end", || (pid("d-end") == "0").then_some(()));
     agent.spawn();
-    controller.wait_hello(2);
+    // The first word about it: whoever believed that it still runs would end what took its place.
+    let hello = controller.wait_hello(2);
+    let told = hello.tasks.iter().find(|task| task.uid == "d-end").expect("it is the agent's");
+    assert_eq!(told.phase(), proto::TaskPhase::Failed, "{told:?}");
     let end = controller.wait_end("d-end");
     assert_eq!((end.exit_code, end.attempt), (Some(8), 1));
     assert_eq!(pid("d-keep"), before);

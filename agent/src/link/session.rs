@@ -57,6 +57,10 @@ pub(crate) enum Command {
     Contact,
 }
 
+/// How long the runtimes get to say what has become of the tasks of an earlier life. An engine that does not answer is not to
+/// keep the whole node away.
+const LOOKED_WITHIN: Duration = Duration::from_secs(2);
+
 /// Why a session ended.
 #[derive(Debug, thiserror::Error)]
 enum SessionError {
@@ -93,6 +97,8 @@ pub(crate) fn outgoing(body: Say) -> proto::AgentMessage {
 impl Link {
     /// Keeps a session until it is dropped.
     pub(crate) async fn run(self, mut node: Node, mut door: Door) {
+        // What ran when the agent before this one ended may have ended since: that is to be the first word about it.
+        let _ = tokio::time::timeout(LOOKED_WITHIN, self.shared.board.known()).await;
         let mut pauses = Pauses::default();
         loop {
             let begun = Instant::now();
