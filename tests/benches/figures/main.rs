@@ -6,6 +6,7 @@
 
 mod floor;
 mod footprint;
+mod herd;
 mod list;
 mod messages;
 mod placement;
@@ -60,6 +61,11 @@ const FIGURES: &[Figure] = &[
     ("sensors", "a camera of 1 MB and 30 Hz for 1, 8, 64 tasks, against copies and ROS", || {
         Box::pin(sensors::all())
     }),
+    (
+        "restart",
+        "the controller killed with 1 000 agents attached, until all are reconciled",
+        || Box::pin(herd::all()),
+    ),
     ("footprint", "RSS and idle CPU of agent and controller", || Box::pin(footprint::all())),
 ];
 
