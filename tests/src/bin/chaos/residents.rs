@@ -67,7 +67,8 @@ pub(crate) async fn move_in(house: &mut House) {
     set(house, "roam", 1, &roam).await;
     let boxed = witness::container(house, &witness::program(house, "box", "box"));
     let boxed = json!({
-        "resources": {"cpu": "10m"},
+        // What starts a container is held to its quota as well.
+        "resources": {"cpu": "500m"},
         "onDisconnect": stops(), "gracePeriodSeconds": 0, "run": boxed,
     });
     set(house, "box", 1, &boxed).await;
