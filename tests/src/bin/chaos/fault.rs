@@ -241,6 +241,9 @@ async fn lost(fault: Fault, house: &House, node: &str, begun: Instant, report: &
 /// On top of the time after which a task without contact stops: then it surely has.
 const STOP_MARGIN: Duration = Duration::from_secs(15);
 
+/// How long before it was away a node may have been heard last: a heartbeat and a half.
+const LAST_HEARD: Duration = Duration::from_millis(900);
+
 /// How a node is away.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Away {
@@ -308,6 +311,10 @@ async fn long_away(house: &mut House, dice: &mut Dice, report: &mut Report) {
         lost(Fault::LongAway, house, node, begun, report).await;
     }
     has_stopped(&tasks, begun, report).await;
+    // Two hours by the date are no two hours.
+    house.clock.set(7_200);
+    tokio::time::sleep(Duration::from_millis(1_500)).await;
+    house.clock.set(0);
     runs_elsewhere(house, &tasks, begun, report).await;
     let away = nodes.iter().any(|(node, _)| node == "robot-2");
     if away && lease_of(house, "robot-2").await != lease {
@@ -349,6 +356,10 @@ async fn runs_elsewhere(house: &House, tasks: &[&Placed], begun: Instant, report
             other => Err(format!("{:?}", other.map(|task| task.metadata.name))),
         };
         wait::until(&format!("{set} runs elsewhere"), elsewhere).await;
+        if begun.elapsed() + LAST_HEARD < stops + STOP_MARGIN {
+            let early = begun.elapsed();
+            report.broken(format!("{set} runs elsewhere after {early:.1?}, and may run still"));
+        }
         let what = format!("{set} without contact: it runs elsewhere");
         report.measured(&what, begun.elapsed(), stops + STOP_MARGIN + floor);
     }
