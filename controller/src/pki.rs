@@ -9,6 +9,7 @@
 //! nothing half-made. Agents get `O=muster:nodes, CN=muster:node:NAME`: of their request only the key is used.
 
 use std::collections::BTreeSet;
+use std::ffi::OsStr;
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, Write as _};
 use std::net::IpAddr;
@@ -327,9 +328,8 @@ pub(crate) fn write_private(path: &Path, bytes: &[u8]) -> Result<(), PkiError> {
     let parent = path.parent().filter(|dir| !dir.as_os_str().is_empty());
     let dir = parent.unwrap_or_else(|| Path::new("."));
     fs::DirBuilder::new().recursive(true).mode(0o700).create(dir).map_err(failed)?;
-    let mut temporary = path.as_os_str().to_owned();
-    temporary.push(format!(".{}.tmp", std::process::id()));
-    let temporary = PathBuf::from(temporary);
+    sweep(dir, path);
+    let temporary = path.with_added_extension(format!("{}.tmp", std::process::id()));
     let write = || -> io::Result<()> {
         let mut file = OpenOptions::new()
             .write(true)
@@ -347,6 +347,22 @@ pub(crate) fn write_private(path: &Path, bytes: &[u8]) -> Result<(), PkiError> {
         drop(fs::remove_file(&temporary));
         failed(source)
     })
+}
+
+/// Removes what a writer of this file left that was killed. Two controllers may write one kubeconfig: the file of one that
+/// lives stays.
+fn sweep(dir: &Path, path: &Path) {
+    let Some(name) = path.file_name().and_then(OsStr::to_str) else { return };
+    for entry in fs::read_dir(dir).into_iter().flatten().flatten() {
+        let found = entry.file_name();
+        let writer = found.to_str().and_then(|found| {
+            found.strip_prefix(name)?.strip_prefix('.')?.strip_suffix(".tmp")?.parse::<u32>().ok()
+        });
+        if writer.is_some_and(|pid| !Path::new("/proc").join(pid.to_string()).exists()) {
+            // What stays is no harm but the room that it takes.
+            drop(fs::remove_file(entry.path()));
+        }
+    }
 }
 
 /// Lower-case hex.
