@@ -123,7 +123,7 @@ async fn has_sealed(connection: &mut SqliteConnection) -> Result<bool, sqlx::Err
 }
 
 impl Sqlite {
-    /// Writes rows anew that were sealed with an older key, and leaves nothing of the older form behind.
+    /// Writes rows anew that were sealed with an older key.
     async fn reseal(&mut self, mut rows: Vec<(i64, String)>) -> Result<(), BackendError> {
         if rows.is_empty() {
             return Ok(());
@@ -144,7 +144,6 @@ impl Sqlite {
             }
             transaction.commit().await?;
         }
-        sqlx::query("PRAGMA wal_checkpoint(TRUNCATE)").execute(&mut *connection).await?;
         sqlx::query("PRAGMA secure_delete = OFF").execute(connection).await?;
         Ok(())
     }
@@ -213,6 +212,9 @@ impl Backend for Sqlite {
             }
             drop(rows);
             self.reseal(old).await?;
+            // The log still has the rows as they were, also of a life that was killed before it came to this.
+            let connection = self.connection().await?;
+            sqlx::query("PRAGMA wal_checkpoint(TRUNCATE)").execute(&mut *connection).await?;
             let compacted = sqlx::query("SELECT value FROM meta WHERE name = 'compacted'")
                 .fetch_one(self.connection().await?)
                 .await?;
