@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::fs::{self, File};
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Stdio};
+use std::process::{Child, Command, ExitStatus, Stdio};
 use std::time::Instant;
 
 use base64::Engine as _;
@@ -35,6 +35,8 @@ pub struct Cluster {
     listen: String,
     /// Of the controller, beside those that every test's has.
     flags: Vec<String>,
+    /// Of the next start of each daemon, by its name.
+    variables: BTreeMap<String, (String, String)>,
 }
 
 #[derive(Debug)]
@@ -122,18 +124,38 @@ impl Cluster {
 
     /// The same, with flags of the controller's.
     pub async fn start_with(flags: &[&str]) -> Self {
+        let mut cluster = Self::prepare(flags);
+        cluster.start_controller().await;
+        cluster
+    }
+
+    /// The same before the first start of the controller.
+    #[must_use]
+    pub fn prepare(flags: &[&str]) -> Self {
         // Both TLS providers may be linked in; the one that is meant must be said.
         drop(rustls::crypto::ring::default_provider().install_default());
         let dir = TempDir::with_prefix("muster-test-").expect("a temporary directory");
-        let mut cluster = Cluster {
+        Cluster {
             dir,
             controller: None,
             agents: BTreeMap::new(),
             listen: "127.0.0.1:0".to_owned(),
             flags: flags.iter().map(|&flag| flag.to_owned()).collect(),
-        };
-        cluster.start_controller().await;
-        cluster
+            variables: BTreeMap::new(),
+        }
+    }
+
+    /// Gives the daemon of this name (`controller`, or an agent's) a variable from its next start on, or none.
+    pub fn set_variable(&mut self, daemon: &str, variable: Option<(&str, &str)>) {
+        self.variables.remove(daemon);
+        if let Some((name, value)) = variable {
+            self.variables.insert(daemon.to_owned(), (name.to_owned(), value.to_owned()));
+        }
+    }
+
+    /// Adds a flag of the controller's for its next start.
+    pub fn add_flag(&mut self, flag: &str, value: &str) {
+        self.flags.extend([flag.to_owned(), value.to_owned()]);
     }
 
     /// The directory with everything that the cluster writes.
@@ -181,7 +203,8 @@ impl Cluster {
         url.trim_start_matches("https://").clone_into(&mut self.listen);
     }
 
-    fn spawn_controller(&mut self) {
+    /// Starts the controller's process, and does not wait for it to be ready.
+    pub fn spawn_controller(&mut self) {
         assert!(self.controller.is_none(), "the controller runs");
         let child = Command::new(binary("muster-controller"))
             .args(["--listen", &self.listen, "--data-dir"])
@@ -189,6 +212,7 @@ impl Cluster {
             .arg("--kubeconfig")
             .arg(self.kubeconfig())
             .args(&self.flags)
+            .envs(self.variables.get("controller").cloned())
             .stdin(Stdio::null())
             .stdout(self.log("controller"))
             .stderr(self.log("controller"))
@@ -248,6 +272,21 @@ impl Cluster {
         let mut child = self.controller.take().expect("the controller runs");
         child.kill().expect("SIGKILL");
         child.wait().expect("it is ours");
+    }
+
+    /// Waits for the end of a daemon that ends by itself, and says how it did.
+    pub async fn ended(&mut self, daemon: &str) -> ExitStatus {
+        let process = match daemon {
+            "controller" => &mut self.controller,
+            agent => &mut self.agents.get_mut(agent).expect("an agent of this cluster").process,
+        };
+        let status = wait::until("ended", || {
+            let ended = process.as_mut().expect("it runs").try_wait().expect("it is ours");
+            std::future::ready(ended.ok_or_else(|| format!("{daemon} runs")))
+        })
+        .await;
+        *process = None;
+        status
     }
 
     /// Waits for the end of a controller that was told to end.
@@ -363,9 +402,14 @@ impl Cluster {
     pub async fn join(&mut self, options: AgentOptions) {
         let token = self.token().await;
         let name = options.name.clone();
-        self.agents.insert(name.clone(), Agent { options, process: None });
+        self.enlist(options);
         self.spawn_agent(&name, Some(&token));
         self.node_ready(&name).await;
+    }
+
+    /// Makes an agent known, and does not start it.
+    pub fn enlist(&mut self, options: AgentOptions) {
+        self.agents.insert(options.name.clone(), Agent { options, process: None });
     }
 
     /// Starts an agent's process, and does not wait for its node.
@@ -377,6 +421,7 @@ impl Cluster {
             .arg("--data-dir")
             .arg(self.dir.path().join(name))
             .args(&options.flags)
+            .envs(self.variables.get(name).cloned())
             .stdin(Stdio::null())
             .stdout(self.log(name))
             .stderr(self.log(name));

@@ -15,6 +15,7 @@ use futures::TryFutureExt;
 use http::{Request, StatusCode, header};
 use hyper::body::Body;
 use hyper_util::rt::TokioIo;
+use muster_failpoint::{Failpoint, Step, reach};
 use rcgen::{CertificateParams, DnType, KeyPair};
 use rustls::{ClientConfig, ServerConfig};
 use serde::{Deserialize, Serialize};
@@ -164,7 +165,7 @@ impl Credentials {
         std::fs::create_dir_all(&self.dir).map_err(FileError::at("make", &self.dir))?;
         let key = KeyPair::generate().map_err(JoinError::Key)?;
         let pem = key.serialize_pem();
-        durable::write(&path, pem.as_bytes(), 0o600, Keep::PowerCut)?;
+        durable::write(Failpoint::AskedKey, &path, pem.as_bytes(), 0o600, Keep::PowerCut)?;
         Ok(key)
     }
 
@@ -182,12 +183,14 @@ impl Credentials {
     fn renew(&self, key: String, answer: JoinAnswer) -> Result<(), FileError> {
         let JoinAnswer { certificate, ca } = answer;
         let renewed = Renewed { ca, certificate, key };
-        durable::write_json(&self.dir.join(RENEWED), &renewed, Keep::PowerCut)
+        durable::write_json(Failpoint::Renewal, &self.dir.join(RENEWED), &renewed, Keep::PowerCut)
     }
 
     fn write(&self, key: &str, answer: &JoinAnswer, token: &Token) -> Result<(), FileError> {
         // Those of an earlier join end first: a key never stands beside another's certificate.
-        for former in ["node.crt", RENEWED].map(|name| self.dir.join(name)) {
+        for (former, step) in [("node.crt", Step::Before), (RENEWED, Step::Half)] {
+            reach(Failpoint::FormerJoin, step);
+            let former = self.dir.join(former);
             match std::fs::remove_file(&former) {
                 Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
                     return Err(FileError::at("remove", &former)(error));
@@ -195,13 +198,14 @@ impl Credentials {
                 _ => {}
             }
         }
-        for (name, text) in [
-            ("node.key", key),
-            ("ca.crt", &answer.ca),
-            ("token-id", token.id()),
-            ("node.crt", &answer.certificate),
+        reach(Failpoint::FormerJoin, Step::After);
+        for (point, name, text) in [
+            (Failpoint::JoinKey, "node.key", key),
+            (Failpoint::JoinCa, "ca.crt", &answer.ca),
+            (Failpoint::JoinToken, "token-id", token.id()),
+            (Failpoint::JoinCertificate, "node.crt", &answer.certificate),
         ] {
-            durable::write(&self.dir.join(name), text.as_bytes(), 0o600, Keep::PowerCut)?;
+            durable::write(point, &self.dir.join(name), text.as_bytes(), 0o600, Keep::PowerCut)?;
         }
         Ok(())
     }

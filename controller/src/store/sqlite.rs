@@ -13,6 +13,7 @@ use std::time::Duration;
 
 use futures::future::BoxFuture;
 use futures::{FutureExt as _, TryStreamExt as _};
+use muster_failpoint::{Failpoint, Step, reach};
 use sqlx::migrate::{MigrateError, Migration, MigrationType, Migrator};
 use sqlx::sqlite::{SqliteConnectOptions, SqliteConnection, SqliteJournalMode, SqliteSynchronous};
 use sqlx::{ConnectOptions as _, Connection as _, Row as _, SqlSafeStr as _};
@@ -142,7 +143,9 @@ impl Sqlite {
                 let update = sqlx::query("UPDATE kv SET value = ? WHERE revision = ?");
                 update.bind(value).bind(revision).execute(&mut *transaction).await?;
             }
+            reach(Failpoint::StoreReseal, Step::Before);
             transaction.commit().await?;
+            reach(Failpoint::StoreReseal, Step::After);
         }
         sqlx::query("PRAGMA secure_delete = OFF").execute(connection).await?;
         Ok(())
