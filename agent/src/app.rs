@@ -215,6 +215,7 @@ pub async fn serve(
         }
         _ => {}
     }
+    credentials.settle()?;
     // Only now: a join that failed must not tie the directory to a name.
     identity.write(&config.data_dir)?;
     config.declared.keep(&config.data_dir)?;

@@ -9,6 +9,7 @@ use std::sync::Arc;
 use muster_agent_core::workload::Workload;
 use muster_api::id::TaskUid;
 use muster_api::kind::task::TaskSpec;
+use muster_failpoint::{Failpoint, Step, reach};
 use serde::{Deserialize, Serialize};
 
 use crate::durable::{self, FileError, Keep};
@@ -98,8 +99,10 @@ impl Checkpoint {
     fn make_dir(&self, uid: &TaskUid) -> Result<PathBuf, FileError> {
         let dir = self.task_dir(uid);
         if !dir.exists() {
+            reach(Failpoint::TaskDir, Step::Before);
             fs::DirBuilder::new().mode(0o711).create(&dir).map_err(FileError::at("make", &dir))?;
             durable::sync_dir(&self.tasks)?;
+            reach(Failpoint::TaskDir, Step::After);
         }
         Ok(dir)
     }
@@ -108,15 +111,10 @@ impl Checkpoint {
     pub(crate) fn write_given(&self, uid: &TaskUid, given: &Given) -> Result<(), FileError> {
         let path = self.make_dir(uid)?.join(SEALED);
         let Some(given) = given else {
-            return match fs::remove_file(&path) {
-                Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
-                    Err(FileError::at("remove", &path)(error))
-                }
-                _ => Ok(()),
-            };
+            return remove_file(&path);
         };
         let sealed = self.vault.seal(uid, given).map_err(FileError::at("seal", &path))?;
-        durable::write(&path, &sealed, 0o600, Keep::PowerCut)
+        durable::write(Failpoint::TaskGiven, &path, &sealed, 0o600, Keep::PowerCut)
     }
 
     /// None: there is nothing, or nothing that this agent can open. The controller sends it again.
@@ -131,25 +129,23 @@ impl Checkpoint {
 
     pub(crate) fn write(&self, record: &Record) -> Result<(), FileError> {
         let dir = self.make_dir(&record.workload.uid)?;
-        durable::write_json(&dir.join("task.json"), record, Keep::PowerCut)
+        durable::write_json(Failpoint::TaskRecord, &dir.join("task.json"), record, Keep::PowerCut)
     }
 
     /// Drops a task whole. Its record goes first: a directory without one is swept at the next start.
     pub(crate) fn drop_task(&self, uid: &TaskUid) -> Result<(), FileError> {
         let dir = self.task_dir(uid);
-        let record = dir.join("task.json");
-        match fs::remove_file(&record) {
+        reach(Failpoint::TaskRemoval, Step::Before);
+        remove_file(&dir.join("task.json"))?;
+        reach(Failpoint::TaskRemoval, Step::Half);
+        match fs::remove_dir_all(&dir) {
             Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
-                return Err(FileError::at("remove", &record)(error));
+                return Err(FileError::at("remove", &dir)(error));
             }
             _ => {}
         }
-        match fs::remove_dir_all(&dir) {
-            Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
-                Err(FileError::at("remove", &dir)(error))
-            }
-            _ => Ok(()),
-        }
+        reach(Failpoint::TaskRemoval, Step::After);
+        Ok(())
     }
 
     /// Every task of an earlier life. A directory without a record is removed; a record that cannot
@@ -171,5 +167,15 @@ impl Checkpoint {
             }
         }
         Ok(records)
+    }
+}
+
+/// Removes a file that may not be there.
+fn remove_file(path: &Path) -> Result<(), FileError> {
+    match fs::remove_file(path) {
+        Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
+            Err(FileError::at("remove", path)(error))
+        }
+        _ => Ok(()),
     }
 }

@@ -11,6 +11,7 @@ use muster_api::name::{FunctionName, NodeName};
 use muster_api::pose::DEFAULT_MAP;
 use muster_api::quantity::{Bytes, MilliCpu};
 use muster_api::resource::parse_function_list;
+use muster_failpoint::Failpoint;
 use serde::Deserialize;
 
 use crate::declared::Declared;
@@ -444,7 +445,12 @@ impl Identity {
     }
 
     pub(crate) fn write(&self, data_dir: &Path) -> Result<(), FileError> {
-        durable::write_json(&data_dir.join("agent.json"), self, Keep::PowerCut)
+        durable::write_json(
+            Failpoint::AgentIdentity,
+            &data_dir.join("agent.json"),
+            self,
+            Keep::PowerCut,
+        )
     }
 }
 

@@ -4,6 +4,7 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
+use muster_failpoint::Failpoint;
 use serde::{Deserialize, Serialize};
 
 use crate::durable::{self, FileError, Keep};
@@ -39,7 +40,7 @@ impl Declared {
         if Self::last(data_dir).is_ok_and(|last| last == *self) {
             return Ok(());
         }
-        durable::write_json(&data_dir.join(FILE), self, Keep::PowerCut)
+        durable::write_json(Failpoint::AgentDeclared, &data_dir.join(FILE), self, Keep::PowerCut)
     }
 
     /// Takes from `last` what is not said now. Returns the flags that were remembered so.

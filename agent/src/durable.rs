@@ -5,6 +5,7 @@ use std::io::{self, Write};
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 
+use muster_failpoint::{Failpoint, Step, reach};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
@@ -34,8 +35,15 @@ pub(crate) enum Keep {
     PowerCut,
 }
 
-/// Replaces `path` with `bytes`, whole.
-pub(crate) fn write(path: &Path, bytes: &[u8], mode: u32, keep: Keep) -> Result<(), FileError> {
+/// Replaces `path` with `bytes`, whole. `point`: what it is, for tests that let this process die meanwhile.
+pub(crate) fn write(
+    point: Failpoint,
+    path: &Path,
+    bytes: &[u8],
+    mode: u32,
+    keep: Keep,
+) -> Result<(), FileError> {
+    reach(point, Step::Before);
     let mut tmp = path.as_os_str().to_owned();
     tmp.push(".tmp");
     let tmp = PathBuf::from(tmp);
@@ -46,16 +54,19 @@ pub(crate) fn write(path: &Path, bytes: &[u8], mode: u32, keep: Keep) -> Result<
         .mode(mode)
         .open(&tmp)
         .map_err(FileError::at("create", &tmp))?;
+    reach(point, Step::Created);
     file.write_all(bytes).map_err(FileError::at("write", &tmp))?;
     if keep == Keep::PowerCut {
         file.sync_data().map_err(FileError::at("sync", &tmp))?;
     }
+    reach(point, Step::Written);
     fs::rename(&tmp, path).map_err(FileError::at("rename to", path))?;
     if keep == Keep::PowerCut
         && let Some(dir) = path.parent()
     {
         sync_dir(dir)?;
     }
+    reach(point, Step::After);
     Ok(())
 }
 
@@ -65,6 +76,7 @@ pub(crate) fn sync_dir(dir: &Path) -> Result<(), FileError> {
 }
 
 pub(crate) fn write_json<T: Serialize>(
+    point: Failpoint,
     path: &Path,
     value: &T,
     keep: Keep,
@@ -72,7 +84,7 @@ pub(crate) fn write_json<T: Serialize>(
     let bytes = serde_json::to_vec(value)
         .map_err(io::Error::from)
         .map_err(FileError::at("encode", path))?;
-    write(path, &bytes, 0o600, keep)
+    write(point, path, &bytes, 0o600, keep)
 }
 
 /// `None`: there is no such file.

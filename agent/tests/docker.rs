@@ -35,7 +35,9 @@ fn image() -> &'static str {
         let dir = tempfile::tempdir().unwrap();
         let bin = dir.path().join("bin");
         std::fs::create_dir(&bin).unwrap();
-        for name in ["busybox", "sh", "sleep", "echo", "dd", "cat", "id"] {
+        for name in [
+            "busybox", "sh", "sleep", "echo", "dd", "cat", "id", "mv", "rm", "mkdir", "mount", "ls",
+        ] {
             std::fs::copy("/bin/busybox", bin.join(name)).unwrap();
         }
         let tar = dir.path().join("root.tar");
@@ -124,6 +126,42 @@ fn a_container_has_few_privileges_and_gains_none() {
     assert_eq!(there, "hello\n");
 }
 
+/// Root in a container, which tries each of these and says what it could do.
+const TRIES: &str = "try() { \"$@\" 2>/dev/null && echo could: \"$*\"; }
+    try sh -c 'echo x > /run/muster/observed'
+    try mkdir /run/muster/sensors/lidar
+    try rm -r /run/muster/sensors
+    try mv /run/muster/own /run/muster/other
+    try rm $MUSTER_EXECUTOR_SOCKET
+    try mv $MUSTER_EXECUTOR_SOCKET $MUSTER_EXECUTOR_SOCKET.old
+    try sh -c 'echo x > /run/muster-executor/x'
+    try mount -o remount,rw /run/muster
+    echo '/scan 9.8' > $MUSTER_RUN_DIR/observed && echo tells
+    echo carries a tray > $MUSTER_RUN_DIR/mission-lock && echo locks
+    [ -S $MUSTER_EXECUTOR_SOCKET ] && echo sees the socket
+    ls -1 /run/muster
+    until [ -e $MUSTER_RUN_DIR/go ]; do sleep 0.1; done";
+
+#[test]
+fn a_container_writes_its_own_directory_and_nothing_beside() {
+    let _cleanup = Cleanup(vec!["d-beside"]);
+    let controller = Controller::start();
+    let agent = start(&controller);
+    controller.assign("d-beside", sh(TRIES));
+    let lock = until("a mission", || controller.state()?.mission_locks.pop());
+    assert_eq!(lock.reason, "carries a tray");
+    // Where the agent looks is where it looked before: containers of an older one go on to count.
+    let run = agent.task_dir("d-beside").join("run");
+    assert_eq!(std::fs::read_to_string(run.join("observed")).unwrap(), "/scan 9.8\n");
+    std::fs::write(run.join("go"), "").unwrap();
+    assert_eq!(controller.wait_end("d-beside").exit_code, Some(0));
+    let ask = proto::LogRequest { id: 1, uid: "d-beside".to_owned(), ..Default::default() };
+    let said = controller.logs(ask).0;
+    assert_eq!(said, "tells\nlocks\nsees the socket\nown\nsensors\n");
+    controller.release("d-beside");
+    until("the directory to go", || (!agent.task_dir("d-beside").exists()).then_some(()));
+}
+
 #[test]
 fn a_container_runs_and_its_exit_code_is_reported() {
     let _cleanup = Cleanup(vec!["d-ok", "d-bad", "d-none"]);
@@ -203,7 +241,8 @@ fn containers_outlive_the_agent() {
     let controller = Controller::start();
     let mut agent = start(&controller);
     controller.assign("d-keep", sh("while :; do sleep 1; done"));
-    controller.assign("d-end", sh("while [ ! -e /run/muster/go ]; do sleep 0.05; done; exit 8"));
+    controller
+        .assign("d-end", sh("while [ ! -e $MUSTER_RUN_DIR/go ]; do sleep 0.05; done; exit 8"));
     controller.wait_running("d-keep");
     controller.wait_running("d-end");
     let pid = |uid: &str| docker(&["inspect", "-f", "{{.State.Pid}}", &container(uid)]);
@@ -317,7 +356,7 @@ fn wait_ready(controller: &Controller, uid: &str, ready: bool) -> proto::TaskRep
 fn served(network: &str, port: u16) -> Value {
     json!({
         "run": { "container": { "image": image(), "network": network,
-            "command": ["/bin/busybox", "httpd", "-f", "-p", port.to_string(), "-h", "/run/muster"] } },
+            "command": ["/bin/busybox", "httpd", "-f", "-p", port.to_string(), "-h", "/run/muster/own"] } },
         "readiness": { "http": { "path": "/ready", "port": port }, "period": "100ms",
             "timeout": "20s", "initialDelay": "2s", "failureThreshold": 1 },
         "liveness": { "tcp": { "port": port }, "period": "100ms", "timeout": "20s",
@@ -369,10 +408,13 @@ fn a_check_runs_inside_its_container_and_is_killed_when_it_takes_too_long() {
     let exec = |argv: Value| json!({ "exec": { "command": argv }, "period": "200ms", "timeout": "20s", "failureThreshold": 1 });
     let mut spec = sh("trap 'exit 0' TERM; while :; do sleep 0.1; done");
     spec["run"]["container"]["env"] = json!([{ "name": "A", "value": "b" }]);
-    spec["readiness"] =
-        exec(json!(["/bin/sh", "-c", "[ -e /run/muster/ok ] || { echo $A is missing; exit 3; }"]));
+    spec["readiness"] = exec(json!([
+        "/bin/sh",
+        "-c",
+        "[ -e $MUSTER_RUN_DIR/ok ] || { echo $A is missing; exit 3; }"
+    ]));
     spec["liveness"] =
-        exec(json!(["/bin/sh", "-c", "[ ! -e /run/muster/hung ] || { echo hung; exit 1; }"]));
+        exec(json!(["/bin/sh", "-c", "[ ! -e $MUSTER_RUN_DIR/hung ] || { echo hung; exit 1; }"]));
     controller.assign("d-check", spec);
     controller
         .wait("d-check", "answer", |r| r.message.contains("exited with code 3: b is missing"));

@@ -105,6 +105,25 @@ fn environment_directory_and_user() {
 }
 
 #[test]
+fn a_process_of_another_user_writes_its_own_directories_and_nothing_beside() {
+    let controller = Controller::start();
+    let agent = Agent::start(&controller);
+    let mut spec = sh("try() { \"$@\" 2>/dev/null && echo could: \"$*\"; }
+        try touch $MUSTER_RUN_DIR/../beside
+        try mkdir $MUSTER_RUN_DIR/../../another
+        try rm $MUSTER_EXECUTOR_SOCKET
+        try mv $MUSTER_RUN_DIR/../executor $MUSTER_RUN_DIR/executor
+        try cat $MUSTER_RUN_DIR/../task.json
+        touch $MUSTER_RUN_DIR/observed here && [ -S $MUSTER_EXECUTOR_SOCKET ] && echo writes its own");
+    spec["run"]["process"]["user"] = json!("nobody");
+    controller.assign("beside", spec);
+    assert_eq!(controller.wait_end("beside").exit_code, Some(0));
+    let ask = proto::LogRequest { id: 1, uid: "beside".to_owned(), ..Default::default() };
+    assert_eq!(controller.logs(ask).0, "writes its own\n");
+    assert!(agent.task_dir("beside").join("run/observed").exists());
+}
+
+#[test]
 fn the_agent_is_killed_and_its_tasks_go_on() {
     let controller = Controller::start();
     let mut agent = Agent::start(&controller);

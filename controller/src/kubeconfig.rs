@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
+use muster_failpoint::{Failpoint, Step, reach};
 
 use crate::pki::{Pem, PkiError, write_private};
 
@@ -69,7 +70,10 @@ pub(crate) fn write(
         Err(_) if asked => {}
         Err(source) => return Err(KubeconfigError::Read { path: path.to_owned(), source }),
     }
-    Ok(write_private(path, text.as_bytes())?)
+    reach(Failpoint::Kubeconfig, Step::Before);
+    write_private(Failpoint::Kubeconfig, path, text.as_bytes())?;
+    reach(Failpoint::Kubeconfig, Step::After);
+    Ok(())
 }
 
 /// Whether the file trusts our CA.

@@ -9,6 +9,7 @@
 //! nothing half-made. Agents get `O=muster:nodes, CN=muster:node:NAME`: of their request only the key is used.
 
 use std::collections::BTreeSet;
+use std::ffi::OsStr;
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, Write as _};
 use std::net::IpAddr;
@@ -19,6 +20,7 @@ use std::time::Duration;
 
 use jiff::Timestamp;
 use muster_api::direct::server_name;
+use muster_failpoint::{Failpoint, Step, reach};
 use rcgen::{
     BasicConstraints, CertificateParams, CertificateSigningRequestParams, DistinguishedName,
     DnType, ExtendedKeyUsagePurpose, IsCa, Issuer, KeyPair, KeyUsagePurpose,
@@ -133,13 +135,20 @@ impl Pki {
 
     /// The administrator's certificate, made anew when it nears its end.
     pub(crate) fn admin(&self, now: Timestamp) -> Result<Pem, PkiError> {
-        self.keep("admin", now, |_| true, || client_params("admin", ADMINS, (now, self.ttl)))
+        self.keep(
+            ("admin", Failpoint::AdminPair),
+            now,
+            |_| true,
+            || client_params("admin", ADMINS, (now, self.ttl)),
+        )
     }
 
     /// The server's certificate, made anew when it nears its end. `names` are the names and addresses that clients may dial.
     pub(crate) fn server(&self, names: &BTreeSet<String>, now: Timestamp) -> Result<Pem, PkiError> {
         let fits = |present: &BTreeSet<String>| present == names;
-        self.keep("server", now, fits, || server_params(names, (now, self.ttl)))
+        self.keep(("server", Failpoint::ServerPair), now, fits, || {
+            server_params(names, (now, self.ttl))
+        })
     }
 
     /// TLS for the one port, with the server's certificate.
@@ -182,7 +191,7 @@ impl Pki {
     /// The pair `name`, made anew when it is missing, nears its end or does not fit.
     fn keep(
         &self,
-        name: &str,
+        (name, point): (&str, Failpoint),
         now: Timestamp,
         fits: impl Fn(&BTreeSet<String>) -> bool,
         params: impl Fn() -> Result<CertificateParams, PkiError>,
@@ -199,7 +208,7 @@ impl Pki {
         let key = KeyPair::generate()?;
         let certificate = params()?.signed_by(&key, &self.issuer)?;
         let pair = Pem { certificate: certificate.pem(), key: key.serialize_pem() };
-        write_pair(&self.dir, name, &pair)?;
+        write_pair((&self.dir, name), point, &pair)?;
         Ok(pair)
     }
 }
@@ -212,7 +221,7 @@ fn make_ca(dir: &Path, now: Timestamp) -> Result<Pem, PkiError> {
     params.key_usages = vec![KeyUsagePurpose::KeyCertSign, KeyUsagePurpose::DigitalSignature];
     let key = KeyPair::generate()?;
     let pair = Pem { certificate: params.self_signed(&key)?.pem(), key: key.serialize_pem() };
-    write_pair(dir, "ca", &pair)?;
+    write_pair((dir, "ca"), Failpoint::CaPair, &pair)?;
     Ok(pair)
 }
 
@@ -297,13 +306,14 @@ fn read(path: &Path) -> Result<Option<String>, PkiError> {
     }
 }
 
-fn write_pair(dir: &Path, name: &str, pair: &Pem) -> Result<(), PkiError> {
+fn write_pair((dir, name): (&Path, &str), point: Failpoint, pair: &Pem) -> Result<(), PkiError> {
+    reach(point, Step::Before);
     let parts = ["key", "crt"].map(|part| {
         let path = dir.join(format!("{name}.{part}"));
         (path.with_added_extension("new"), path)
     });
     for ((new, _), text) in parts.iter().zip([&pair.key, &pair.certificate]) {
-        write_private(new, text.as_bytes())?;
+        write_private(point, new, text.as_bytes())?;
     }
     // An old certificate beside the new key would be a pair that does not fit. What there is goes when the disk has the new.
     let [_, (_, certificate)] = &parts;
@@ -313,23 +323,24 @@ fn write_pair(dir: &Path, name: &str, pair: &Pem) -> Result<(), PkiError> {
         }
         _ => {}
     }
-    for (new, path) in parts {
+    for ((new, path), step) in parts.into_iter().zip([Step::Removed, Step::Half]) {
+        reach(point, step);
         let failed = |source| PkiError::File { path: path.clone(), source };
         fs::rename(&new, &path).map_err(failed)?;
         File::open(dir).and_then(|dir| dir.sync_all()).map_err(failed)?;
     }
+    reach(point, Step::After);
     Ok(())
 }
 
-/// Writes a file whole or not at all, readable by its owner only.
-pub(crate) fn write_private(path: &Path, bytes: &[u8]) -> Result<(), PkiError> {
+/// Writes a file whole or not at all, readable by its owner only. `point`: what it is, or is a part of.
+pub(crate) fn write_private(point: Failpoint, path: &Path, bytes: &[u8]) -> Result<(), PkiError> {
     let failed = |source| PkiError::File { path: path.to_owned(), source };
     let parent = path.parent().filter(|dir| !dir.as_os_str().is_empty());
     let dir = parent.unwrap_or_else(|| Path::new("."));
     fs::DirBuilder::new().recursive(true).mode(0o700).create(dir).map_err(failed)?;
-    let mut temporary = path.as_os_str().to_owned();
-    temporary.push(format!(".{}.tmp", std::process::id()));
-    let temporary = PathBuf::from(temporary);
+    sweep(dir, path);
+    let temporary = path.with_added_extension(format!("{}.tmp", std::process::id()));
     let write = || -> io::Result<()> {
         let mut file = OpenOptions::new()
             .write(true)
@@ -337,8 +348,10 @@ pub(crate) fn write_private(path: &Path, bytes: &[u8]) -> Result<(), PkiError> {
             .truncate(true)
             .mode(0o600)
             .open(&temporary)?;
+        reach(point, Step::Created);
         file.write_all(bytes)?;
         file.sync_all()?;
+        reach(point, Step::Written);
         fs::rename(&temporary, path)?;
         File::open(dir)?.sync_all()
     };
@@ -347,6 +360,22 @@ pub(crate) fn write_private(path: &Path, bytes: &[u8]) -> Result<(), PkiError> {
         drop(fs::remove_file(&temporary));
         failed(source)
     })
+}
+
+/// Removes what a writer of this file left that was killed. Two controllers may write one kubeconfig: the file of one that
+/// lives stays.
+fn sweep(dir: &Path, path: &Path) {
+    let Some(name) = path.file_name().and_then(OsStr::to_str) else { return };
+    for entry in fs::read_dir(dir).into_iter().flatten().flatten() {
+        let found = entry.file_name();
+        let writer = found.to_str().and_then(|found| {
+            found.strip_prefix(name)?.strip_prefix('.')?.strip_suffix(".tmp")?.parse::<u32>().ok()
+        });
+        if writer.is_some_and(|pid| !Path::new("/proc").join(pid.to_string()).exists()) {
+            // What stays is no harm but the room that it takes.
+            drop(fs::remove_file(entry.path()));
+        }
+    }
 }
 
 /// Lower-case hex.

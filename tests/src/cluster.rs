@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::fs::{self, File};
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Stdio};
+use std::process::{Child, Command, ExitStatus, Stdio};
 use std::sync::Arc;
 use std::time::Instant;
 
@@ -38,8 +38,9 @@ pub struct Cluster {
     /// Of the controller, beside those that every test's has.
     flags: Vec<String>,
     /// The controller's, where a test has said so.
-    env: BTreeMap<String, String>,
     data_dir: PathBuf,
+    /// Variables of the next start of each daemon, by its name.
+    variables: BTreeMap<String, BTreeMap<String, String>>,
 }
 
 #[derive(Debug)]
@@ -55,8 +56,6 @@ pub struct AgentOptions {
     pub name: String,
     /// Everything else, as on the command line.
     pub flags: Vec<String>,
-    /// Variables, beside those of the test.
-    pub env: BTreeMap<String, String>,
     /// Where it keeps its data; none: beside the other agents'.
     pub data_dir: Option<PathBuf>,
     /// Whose network it has; none: the caller's.
@@ -85,7 +84,6 @@ impl AgentOptions {
         AgentOptions {
             name: name.to_owned(),
             flags: Vec::new(),
-            env: BTreeMap::new(),
             data_dir: None,
             namespace: None,
         }
@@ -152,20 +150,41 @@ impl Cluster {
 
     /// The same, at an address of the calling thread's namespace.
     pub async fn start_at(listen: &str, flags: &[&str]) -> Self {
+        let mut cluster = Self::prepare(flags);
+        listen.clone_into(&mut cluster.listen);
+        cluster.start_controller().await;
+        cluster
+    }
+
+    /// The same before the first start of the controller.
+    #[must_use]
+    pub fn prepare(flags: &[&str]) -> Self {
         // Both TLS providers may be linked in; the one that is meant must be said.
         drop(rustls::crypto::ring::default_provider().install_default());
         let dir = TempDir::with_prefix("muster-test-").expect("a temporary directory");
-        let mut cluster = Cluster {
+        Cluster {
             controller: None,
             agents: BTreeMap::new(),
-            listen: listen.to_owned(),
+            listen: "127.0.0.1:0".to_owned(),
             flags: flags.iter().map(|&flag| flag.to_owned()).collect(),
-            env: BTreeMap::new(),
             data_dir: dir.path().join("controller"),
+            variables: BTreeMap::new(),
             dir,
-        };
-        cluster.start_controller().await;
-        cluster
+        }
+    }
+
+    /// Gives the daemon of this name (`controller`, or an agent's) a variable from its next start on, or takes it away.
+    pub fn set_variable(&mut self, daemon: &str, name: &str, value: Option<&str>) {
+        let all = self.variables.entry(daemon.to_owned()).or_default();
+        match value {
+            Some(value) => drop(all.insert(name.to_owned(), value.to_owned())),
+            None => drop(all.remove(name)),
+        }
+    }
+
+    /// Adds a flag of the controller's for its next start.
+    pub fn add_flag(&mut self, flag: &str, value: &str) {
+        self.flags.extend([flag.to_owned(), value.to_owned()]);
     }
 
     /// The directory with everything that the cluster writes.
@@ -219,7 +238,8 @@ impl Cluster {
         url.trim_start_matches("https://").clone_into(&mut self.listen);
     }
 
-    fn spawn_controller(&mut self) {
+    /// Starts the controller's process, and does not wait for it to be ready.
+    pub fn spawn_controller(&mut self) {
         assert!(self.controller.is_none(), "the controller runs");
         let child = Command::new(binary("muster-controller"))
             .args(["--listen", &self.listen, "--data-dir"])
@@ -227,7 +247,7 @@ impl Cluster {
             .arg("--kubeconfig")
             .arg(self.kubeconfig())
             .args(&self.flags)
-            .envs(&self.env)
+            .envs(self.variables.get("controller").into_iter().flatten())
             .stdin(Stdio::null())
             .stdout(self.log("controller"))
             .stderr(self.log("controller"))
@@ -245,11 +265,6 @@ impl Cluster {
     /// Where it does from its next start on.
     pub fn set_data_dir(&mut self, dir: PathBuf) {
         self.data_dir = dir;
-    }
-
-    /// A variable of the controller's, from its next start on.
-    pub fn set_env(&mut self, name: &str, value: &str) {
-        self.env.insert(name.to_owned(), value.to_owned());
     }
 
     /// Waits until the controller is ready, and gives its address; `None`: it has ended.
@@ -303,6 +318,21 @@ impl Cluster {
         let mut child = self.controller.take().expect("the controller runs");
         child.kill().expect("SIGKILL");
         child.wait().expect("it is ours");
+    }
+
+    /// Waits for the end of a daemon that ends by itself, and says how it did.
+    pub async fn ended(&mut self, daemon: &str) -> ExitStatus {
+        let process = match daemon {
+            "controller" => &mut self.controller,
+            agent => &mut self.agents.get_mut(agent).expect("an agent of this cluster").process,
+        };
+        let status = wait::until("ended", || {
+            let ended = process.as_mut().expect("it runs").try_wait().expect("it is ours");
+            std::future::ready(ended.ok_or_else(|| format!("{daemon} runs")))
+        })
+        .await;
+        *process = None;
+        status
     }
 
     /// Waits for the end of a controller that was told to end.
@@ -418,9 +448,14 @@ impl Cluster {
     pub async fn join(&mut self, options: AgentOptions) {
         let token = self.token().await;
         let name = options.name.clone();
-        self.agents.insert(name.clone(), Agent { options, process: None });
+        self.enlist(options);
         self.spawn_agent(&name, Some(&token));
         self.node_ready(&name).await;
+    }
+
+    /// Makes an agent known, and does not start it.
+    pub fn enlist(&mut self, options: AgentOptions) {
+        self.agents.insert(options.name.clone(), Agent { options, process: None });
     }
 
     /// Starts an agent's process, and does not wait for its node.
@@ -432,7 +467,7 @@ impl Cluster {
             .arg("--data-dir")
             .arg(options.data_dir.unwrap_or_else(|| self.dir.path().join(name)))
             .args(&options.flags)
-            .envs(&options.env)
+            .envs(self.variables.get(name).into_iter().flatten())
             .stdin(Stdio::null())
             .stdout(self.log(name))
             .stderr(self.log(name));

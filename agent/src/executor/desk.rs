@@ -13,6 +13,7 @@ use muster_agent_core::observed::{End, Said};
 use muster_agent_core::workload::{State, Workload};
 use muster_api::id::TaskUid;
 use muster_api::wire::executor::v1 as proto;
+use muster_failpoint::Failpoint;
 use proto::event::Event as Say;
 use serde::{Deserialize, Serialize};
 use tokio::sync::watch;
@@ -326,7 +327,7 @@ impl Desks {
             let write = move || {
                 // Until it is written, whoever waits for it.
                 let _turn = turn;
-                durable::write_json(&path, &file, Keep::PowerCut)
+                durable::write_json(Failpoint::WorkRecord, &path, &file, Keep::PowerCut)
             };
             match tokio::task::spawn_blocking(write).await {
                 Ok(Ok(())) => return,

@@ -493,6 +493,30 @@ mod tests {
         listener.accept().await.unwrap();
     }
 
+    /// See `muster-hostile`.
+    #[test]
+    fn whatever_a_driver_says_its_commands_come_whole() {
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+        let dir = tempfile::tempdir().unwrap();
+        let reached = runtime.block_on(async {
+            let (settings, listener) = deaf(&dir.path().join("driver"));
+            reached(settings, &listener).await
+        });
+        let all = Mutex::new((runtime, reached));
+        let inputs = muster_hostile::inputs("driver");
+        muster_hostile::feed(bolero::check!(), inputs, |bytes| {
+            let mut all = all.lock().unwrap();
+            let (runtime, (driver, stream, _heard)) = &mut *all;
+            let mut heard = [0; 3];
+            runtime.block_on(async {
+                stream.write_all(bytes).await.unwrap();
+                assert!(driver.command("base:Drive", &Bytes::from_static(b"go")));
+                stream.read_exact(&mut heard).await.unwrap();
+            });
+            assert_eq!(&heard, b"go\n");
+        });
+    }
+
     #[test]
     fn frames() {
         assert_eq!(framed(Framing::Lines, b"go").unwrap(), "go\n");

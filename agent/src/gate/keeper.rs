@@ -16,6 +16,7 @@ use muster_api::id::TaskUid;
 use muster_api::kind::node::estop::{EStopDemand, EStopStatus, EStopTier};
 use muster_api::name::FunctionName;
 use muster_api::wire::gate::v1 as proto;
+use muster_failpoint::Failpoint;
 use tokio::net::UnixStream;
 use tokio::sync::watch;
 
@@ -306,7 +307,12 @@ impl Kept for Keeper {
         // Passable, not listable: tasks of other users find their socket.
         let made = fs::DirBuilder::new().recursive(true).mode(0o711).create(&tasks);
         made.map_err(FileError::at("make", &tasks))?;
-        durable::write_json(&dir.join(settings::FILE), &self.settings, Keep::Crash)?;
+        durable::write_json(
+            Failpoint::GateSettings,
+            &dir.join(settings::FILE),
+            &self.settings,
+            Keep::Crash,
+        )?;
         let path = dir.join(LOG);
         let log = File::options().create(true).append(true).open(&path);
         let log = log.map_err(FileError::at("open", &path))?;

@@ -6,6 +6,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use muster_agent_core::gate::Kept;
+use muster_failpoint::Failpoint;
 use tokio::task::JoinHandle;
 use tokio::time::Instant;
 
@@ -29,7 +30,7 @@ pub(super) fn read(dir: &Path) -> Result<Kept, FileError> {
 /// Writes to `dir`.
 pub(super) fn write_to(dir: &Path) -> Write {
     let path = dir.join(KEPT);
-    Arc::new(move |kept| durable::write_json(&path, kept, Keep::PowerCut))
+    Arc::new(move |kept| durable::write_json(Failpoint::GateRecord, &path, kept, Keep::PowerCut))
 }
 
 /// The record, and what waits for it.

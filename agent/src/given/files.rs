@@ -22,6 +22,7 @@ use std::path::{Path, PathBuf};
 use muster_agent_core::workload::Failure;
 use muster_api::id::TaskUid;
 use muster_api::wire::agent::v1 as proto;
+use muster_failpoint::{Failpoint, Step, reach};
 
 use crate::durable::FileError;
 use crate::runtime::launch::{AttemptId, Launch, Program};
@@ -89,6 +90,7 @@ impl Place {
             retry: true,
         };
         self.clear(&launch.id.uid).map_err(failed)?;
+        reach(Failpoint::AttemptFiles, Step::Before);
         let dir = self.dir(&launch.id, config);
         let owner = owner(launch);
         let container = matches!(launch.program, Program::Container(_));
@@ -102,6 +104,7 @@ impl Place {
             };
             write_file(&dir, &below.join(&file.path), file, owner).map_err(failed)?;
         }
+        reach(Failpoint::AttemptFiles, Step::After);
         match links {
             Some(work) if !container => link(&dir, work, config),
             _ => Ok(()),
@@ -123,6 +126,7 @@ impl Place {
     /// Removes what a task has.
     pub(crate) fn clear(&self, uid: &TaskUid) -> Result<(), FileError> {
         let memory = self.memory.iter().map(|memory| memory.join(uid.as_str()));
+        reach(Failpoint::FilesRemoval, Step::Before);
         for path in memory.chain([self.on_disk(uid)]) {
             match fs::remove_dir_all(&path) {
                 Err(error) if error.kind() != io::ErrorKind::NotFound => {
@@ -131,6 +135,7 @@ impl Place {
                 _ => {}
             }
         }
+        reach(Failpoint::FilesRemoval, Step::After);
         Ok(())
     }
 

@@ -11,6 +11,7 @@ use std::path::Path;
 
 use muster_api::id::TaskUid;
 use muster_api::wire::agent::v1 as proto;
+use muster_failpoint::Failpoint;
 use prost::Message as _;
 use ring::aead::{AES_256_GCM, Aad, LessSafeKey, NONCE_LEN, Nonce, UnboundKey};
 use ring::rand::{SecureRandom as _, SystemRandom};
@@ -42,7 +43,7 @@ impl Vault {
             Err(error) if error.kind() == io::ErrorKind::NotFound => {
                 let mut key = vec![0; KEY_BYTES];
                 SystemRandom::new().fill(&mut key).map_err(broken("make"))?;
-                durable::write(&path, &key, 0o600, Keep::PowerCut)?;
+                durable::write(Failpoint::VaultKey, &path, &key, 0o600, Keep::PowerCut)?;
                 key
             }
             Err(error) => return Err(FileError::at("read", &path)(error)),

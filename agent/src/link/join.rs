@@ -1,7 +1,8 @@
 //! From a token, or from the certificate that is there, to a new one. The key is made here and never leaves.
 //!
 //! ```text
-//!   DIR/pki/ca.crt node.key token-id node.crt   what a join gave, written in this order
+//!   DIR/pki/asked.key                           what a join asks with, until it is over: who asks again is known by it
+//!   DIR/pki/node.key ca.crt token-id node.crt   what a join gave, written in this order
 //!   DIR/pki/renewed.json                        those of the last renewal, in one file: it is there whole or not
 //! ```
 
@@ -14,6 +15,7 @@ use futures::TryFutureExt;
 use http::{Request, StatusCode, header};
 use hyper::body::Body;
 use hyper_util::rt::TokioIo;
+use muster_failpoint::{Failpoint, Step, reach};
 use rcgen::{CertificateParams, DnType, KeyPair};
 use rustls::{ClientConfig, ServerConfig};
 use serde::{Deserialize, Serialize};
@@ -29,6 +31,9 @@ const PATIENCE: Duration = Duration::from_secs(20);
 
 /// An answer holds two certificates, or a status.
 const LONGEST_ANSWER: usize = 256 << 10;
+
+/// The file of the key that a join asks with.
+const ASKED: &str = "asked.key";
 
 /// The file of the last renewal.
 const RENEWED: &str = "renewed.json";
@@ -149,16 +154,43 @@ impl Credentials {
         }
     }
 
+    /// The key that a join asks with: that of an earlier try, which may have been granted without this agent hearing so.
+    fn asked(&self) -> Result<KeyPair, JoinError> {
+        let path = self.dir.join(ASKED);
+        if let Some(key) =
+            std::fs::read_to_string(&path).ok().and_then(|pem| KeyPair::from_pem(&pem).ok())
+        {
+            return Ok(key);
+        }
+        std::fs::create_dir_all(&self.dir).map_err(FileError::at("make", &self.dir))?;
+        let key = KeyPair::generate().map_err(JoinError::Key)?;
+        let pem = key.serialize_pem();
+        durable::write(Failpoint::AskedKey, &path, pem.as_bytes(), 0o600, Keep::PowerCut)?;
+        Ok(key)
+    }
+
+    /// It has joined: nothing is asked any more.
+    pub(crate) fn settle(&self) -> Result<(), FileError> {
+        let path = self.dir.join(ASKED);
+        match std::fs::remove_file(&path) {
+            Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
+                Err(FileError::at("remove", &path)(error))
+            }
+            _ => Ok(()),
+        }
+    }
+
     fn renew(&self, key: String, answer: JoinAnswer) -> Result<(), FileError> {
         let JoinAnswer { certificate, ca } = answer;
         let renewed = Renewed { ca, certificate, key };
-        durable::write_json(&self.dir.join(RENEWED), &renewed, Keep::PowerCut)
+        durable::write_json(Failpoint::Renewal, &self.dir.join(RENEWED), &renewed, Keep::PowerCut)
     }
 
     fn write(&self, key: &str, answer: &JoinAnswer, token: &Token) -> Result<(), FileError> {
-        std::fs::create_dir_all(&self.dir).map_err(FileError::at("make", &self.dir))?;
         // Those of an earlier join end first: a key never stands beside another's certificate.
-        for former in ["node.crt", RENEWED].map(|name| self.dir.join(name)) {
+        for (former, step) in [("node.crt", Step::Before), (RENEWED, Step::Half)] {
+            reach(Failpoint::FormerJoin, step);
+            let former = self.dir.join(former);
             match std::fs::remove_file(&former) {
                 Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
                     return Err(FileError::at("remove", &former)(error));
@@ -166,13 +198,14 @@ impl Credentials {
                 _ => {}
             }
         }
-        for (name, text) in [
-            ("node.key", key),
-            ("ca.crt", &answer.ca),
-            ("token-id", token.id()),
-            ("node.crt", &answer.certificate),
+        reach(Failpoint::FormerJoin, Step::After);
+        for (point, name, text) in [
+            (Failpoint::JoinKey, "node.key", key),
+            (Failpoint::JoinCa, "ca.crt", &answer.ca),
+            (Failpoint::JoinToken, "token-id", token.id()),
+            (Failpoint::JoinCertificate, "node.crt", &answer.certificate),
         ] {
-            durable::write(&self.dir.join(name), text.as_bytes(), 0o600, Keep::PowerCut)?;
+            durable::write(point, &self.dir.join(name), text.as_bytes(), 0o600, Keep::PowerCut)?;
         }
         Ok(())
     }
@@ -187,8 +220,9 @@ pub(crate) async fn join(
     credentials: &Credentials,
 ) -> Result<(), JoinError> {
     let config = tls::by_hash(token.ca_hash)?;
-    let (key, answer) = ask((address, config), Some(token), (node, kind)).await?;
-    credentials.write(&key, &answer, token)?;
+    let key = credentials.asked()?;
+    let answer = ask((address, config), Some(token), (node, kind), &key).await?;
+    credentials.write(&key.serialize_pem(), &answer, token)?;
     Ok(())
 }
 
@@ -201,23 +235,25 @@ pub(crate) async fn renew(
     let mut config = credentials.tls()?;
     // One request, and no streams.
     config.alpn_protocols = vec![b"http/1.1".to_vec()];
-    let (key, answer) = ask((address, config), None, (node, kind)).await?;
+    let key = KeyPair::generate().map_err(JoinError::Key)?;
+    let answer = ask((address, config), None, (node, kind), &key).await?;
+    let key = key.serialize_pem();
     // Whatever was answered: what is stored lets this node in.
     tls::mutual(answer.ca.as_bytes(), answer.certificate.as_bytes(), key.as_bytes())?;
     credentials.renew(key, answer)?;
     Ok(())
 }
 
-/// A new key, as PEM, and what the controller gives for it.
+/// What the controller gives for a key.
 async fn ask(
     (address, config): (&Address, ClientConfig),
     token: Option<&Token>,
     (node, kind): (&str, Kind),
-) -> Result<(String, JoinAnswer), JoinError> {
-    let key = KeyPair::generate().map_err(JoinError::Key)?;
+    key: &KeyPair,
+) -> Result<JoinAnswer, JoinError> {
     let mut params = CertificateParams::default();
     params.distinguished_name.push(DnType::CommonName, node);
-    let csr = params.serialize_request(&key).and_then(|csr| csr.pem()).map_err(JoinError::Key)?;
+    let csr = params.serialize_request(key).and_then(|csr| csr.pem()).map_err(JoinError::Key)?;
     let kind = match kind {
         Kind::Robot => "Robot",
         Kind::Cloud => "Cloud",
@@ -235,9 +271,7 @@ async fn ask(
             .map_or_else(|_| "no reason given".to_owned(), |answer: StatusAnswer| answer.message);
         return Err(JoinError::Refused { node: node.to_owned(), status: status.as_u16(), message });
     }
-    let answer: JoinAnswer =
-        serde_json::from_slice(&body).map_err(|error| JoinError::Http(error.into()))?;
-    Ok((key.serialize_pem(), answer))
+    serde_json::from_slice(&body).map_err(|error| JoinError::Http(error.into()))
 }
 
 async fn post(

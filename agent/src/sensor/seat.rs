@@ -18,6 +18,7 @@ use std::time::Duration;
 use futures::future::select_all;
 use muster_agent_core::sensor::source::Standing;
 use muster_api::name::FunctionName;
+use muster_failpoint::Failpoint;
 use serde_json::json;
 use tokio::net::UnixListener;
 use tokio::sync::watch;
@@ -123,8 +124,15 @@ async fn tell(path: PathBuf, channels: Vec<Arc<Channel>>) {
         };
         let status: BTreeMap<String, _> = channels.iter().zip(&mut stands).map(of).collect();
         let (path, text) = (path.clone(), json!(status).to_string());
-        let write =
-            move || durable::write(&path, format!("{text}\n").as_bytes(), 0o644, Keep::Crash);
+        let write = move || {
+            durable::write(
+                Failpoint::SensorStatus,
+                &path,
+                format!("{text}\n").as_bytes(),
+                0o644,
+                Keep::Crash,
+            )
+        };
         if let Ok(Err(error)) = tokio::task::spawn_blocking(write).await {
             tracing::warn!(%error, "a task is not told how its sensors stand");
         }

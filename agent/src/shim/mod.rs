@@ -29,6 +29,7 @@ use std::os::fd::{AsFd, FromRawFd, OwnedFd, RawFd};
 use std::path::PathBuf;
 
 use muster_agent_core::observed::{End, Exit};
+use muster_failpoint::{self as failpoint, Failpoint, Step};
 use rustix::io::FdFlags;
 
 use crate::clock;
@@ -186,12 +187,14 @@ fn take_variables() -> Result<BTreeMap<OsString, OsString>, StartError> {
 }
 
 fn remove_group(order: &Order) {
+    failpoint::reach(Failpoint::GroupRemoval, Step::Before);
     if let Some(group) = &order.group
         && let Err(error) = group.remove()
     {
         // The agent's next sweep takes it away; the attempt has ended all the same.
         let _ = writeln!(std::io::stderr(), "muster shim: the group stays behind: {error}");
     }
+    failpoint::reach(Failpoint::GroupRemoval, Step::After);
 }
 
 /// One byte to the agent, which may be gone; then the pipe is let go.

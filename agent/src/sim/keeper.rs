@@ -8,6 +8,7 @@ use std::process::Child;
 use std::sync::Arc;
 use std::time::Duration;
 
+use muster_failpoint::Failpoint;
 use rustix::process::{Pid, Signal};
 use tokio::io::{AsyncBufReadExt as _, BufReader};
 use tokio::net::UnixStream;
@@ -108,7 +109,7 @@ impl Kept for Simulator {
         // Nobody but the agent and the gate comes to the robot.
         let made = fs::DirBuilder::new().recursive(true).mode(0o700).create(dir);
         made.map_err(FileError::at("make", dir))?;
-        durable::write(&dir.join(WORLD), &self.world, 0o600, Keep::Crash)?;
+        durable::write(Failpoint::SimWorld, &dir.join(WORLD), &self.world, 0o600, Keep::Crash)?;
         let path = dir.join(LOG);
         let log = File::create(&path).map_err(FileError::at("open", &path))?;
         companion::start(&self.program, VERB, dir, log)

@@ -8,6 +8,7 @@ use muster_agent_core::sim::base::{Base, Place, Velocity};
 use muster_agent_core::sim::camera::Camera;
 use muster_agent_core::sim::laser::Laser;
 use muster_agent_core::sim::world::World;
+use muster_failpoint::Failpoint;
 use muster_ros1::proto::{sensor_msgs, std_msgs};
 use nalgebra::Point2;
 use prost::Message as _;
@@ -173,7 +174,7 @@ impl Robot {
             let Place { at, yaw } = base.place();
             Kept { world: self.digest.clone(), place: [at.x, at.y, yaw], energy: base.energy() }
         };
-        durable::write_json(&self.kept, &kept, Keep::Crash)
+        durable::write_json(Failpoint::SimRobot, &self.kept, &kept, Keep::Crash)
     }
 }
 
@@ -200,7 +201,13 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let world = |text: &str| {
             let settings: Settings = serde_saphyr::from_str(text).unwrap();
-            durable::write_json(&dir.path().join(WORLD), &settings, Keep::Crash).unwrap();
+            durable::write_json(
+                Failpoint::SimWorld,
+                &dir.path().join(WORLD),
+                &settings,
+                Keep::Crash,
+            )
+            .unwrap();
             Robot::open(dir.path(), &settings).unwrap()
         };
         let first = world("battery: {charge: 50}");
@@ -225,7 +232,8 @@ mod tests {
             "walls: [{line: [[2, -9], [2, 9]]}]\nlaser: {from: 0, to: 0.1, rays: 2, deviation: 0}",
         )
         .unwrap();
-        durable::write_json(&dir.path().join(WORLD), &settings, Keep::Crash).unwrap();
+        durable::write_json(Failpoint::SimWorld, &dir.path().join(WORLD), &settings, Keep::Crash)
+            .unwrap();
         let robot = Robot::open(dir.path(), &settings).unwrap();
         let scan = sensor_msgs::LaserScan::decode(robot.scan(3).as_slice()).unwrap();
         assert_eq!((scan.ranges.len(), scan.ranges[0], scan.header.unwrap().seq), (2, 2.0, 3));

@@ -13,6 +13,7 @@ use std::sync::atomic::Ordering;
 use std::thread::JoinHandle;
 
 use jiff::Timestamp;
+use muster_failpoint::{Failpoint, Step, reach};
 use serde::Serialize;
 use tokio::sync::{mpsc, oneshot};
 
@@ -105,7 +106,10 @@ impl Writer {
             true => self.refused.append(&bytes, &mut full),
             false => {
                 self.open(now)?;
-                self.done.append(&bytes, &mut full)
+                reach(Failpoint::AuditLine, Step::Before);
+                let written = self.done.append(&bytes, &mut full);
+                reach(Failpoint::AuditLine, Step::After);
+                written
             }
         });
         if let Err(error) = &written {

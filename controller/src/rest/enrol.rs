@@ -41,6 +41,25 @@ pub(crate) fn is_agent_of(node: &Node, key: &str) -> bool {
     node.status.as_ref().is_some_and(|status| status.agent_keys.iter().any(|one| one == key))
 }
 
+/// What the name of a node is to a candidate.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Name {
+    /// No agent has joined as this node.
+    Free,
+    /// Another one has.
+    Taken,
+    /// It has itself, by this key: the answer did not reach it.
+    Own,
+}
+
+fn name_for(node: &Node, key: &str) -> Name {
+    match has_joined(node) {
+        _ if is_agent_of(node, key) => Name::Own,
+        true => Name::Taken,
+        false => Name::Free,
+    }
+}
+
 /// Whether an agent has joined as this node.
 fn has_joined(node: &Node) -> bool {
     node.status.as_ref().is_some_and(|status| !status.agent_keys.is_empty())
@@ -54,14 +73,14 @@ pub(super) fn taken(node: &str) -> Failure {
     Failure::new(StatusCode::CONFLICT, "Conflict", message)
 }
 
-/// What [`enrol`] would refuse, before a token is spent on it. Says whether the name is taken.
-pub(super) fn check(context: &Context, candidate: &Candidate<'_>) -> Result<bool, Failure> {
+/// What [`enrol`] would refuse, before a token is spent on it.
+pub(super) fn check(context: &Context, candidate: &Candidate<'_>) -> Result<Name, Failure> {
     let stored = context.store.get(&node_key(candidate.node));
     let Some(node) = stored.and_then(|stored| objects::read::<Node>(&stored)) else {
-        return Ok(false);
+        return Ok(Name::Free);
     };
     check_kind(&node, candidate)?;
-    Ok(has_joined(&node))
+    Ok(name_for(&node, &candidate.key))
 }
 
 /// A robot does not become a server because somebody mistyped a name.
@@ -97,7 +116,7 @@ pub(super) async fn enrol(
         let mut node: Node = objects::read(&stored)
             .ok_or_else(|| Failure::internal(format!("node {name:?} does not read as one")))?;
         check_kind(&node, candidate)?;
-        if right == Right::AnyNode && has_joined(&node) {
+        if right == Right::AnyNode && name_for(&node, &candidate.key) == Name::Taken {
             return Err(taken(name));
         }
         if right == Right::Renewal && !candidate.shown.is_some_and(|key| is_agent_of(&node, key)) {

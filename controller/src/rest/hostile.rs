@@ -1,12 +1,16 @@
 //! What clients send that only this module reads, fed with what a stranger may send: see `muster-hostile`.
 
+use std::path::Path;
+
 use bytes::Bytes;
 use http::Uri;
-use serde_json::json;
+use serde_json::{Value, json};
 
+use super::path::Object;
 use super::query::Query;
+use super::registry::Entry;
 use super::selector::Selection;
-use super::{body, patch, protobuf, registry};
+use super::{body, owners, patch, protobuf, registry};
 use crate::objects::{NODES, TASKS};
 use crate::store::{DEEPEST, is_deeper};
 
@@ -36,6 +40,66 @@ fn patches_are_applied_or_refused() {
                 Ok(object) => drop(object.to_string()),
                 Err(failure) => blames_the_client(&failure),
             }
+        }
+    });
+}
+
+fn by(name: &str) -> owners::Writer {
+    let time = "2026-01-01T00:00:00Z".to_owned();
+    owners::Writer { name: name.to_owned(), subresource: "", view: None, time }
+}
+
+/// What is applied on the server: whoever says the same once more changes nothing, and neither does who says the same as another.
+#[test]
+fn applications_are_taken_whole_or_refused() {
+    let entry = registry::of(TASKS).expect("it is served");
+    let manifests = Path::new(env!("CARGO_MANIFEST_DIR")).join("../manifests/examples");
+    let inputs = muster_hostile::inputs("apply").and_those_in(&manifests);
+    muster_hostile::feed(bolero::check!(), inputs, |bytes| {
+        let bytes = Bytes::copy_from_slice(bytes);
+        let target = target(entry, &bytes);
+        let config = match patch::configuration(entry, &target, &bytes) {
+            Ok(config) => config,
+            Err(failure) => return blames_the_client(&failure),
+        };
+        let apply =
+            |live: &Value, name: &str| owners::applied(entry, live, &config, &by(name), false);
+        let first = match apply(&Value::Null, "first") {
+            Ok(first) => first,
+            Err(failure) => return blames_the_client(&failure),
+        };
+        assert_eq!(apply(&first, "first").expect("it is theirs"), first);
+        let both = apply(&first, "second").expect("they agree");
+        assert_eq!(without_owners(&both), without_owners(&first));
+    });
+}
+
+fn without_owners(object: &Value) -> Value {
+    let mut object = object.clone();
+    object["metadata"]["managedFields"] = Value::Null;
+    object
+}
+
+/// The object that the path has: the one that the bytes name, if they name one.
+fn target(entry: &'static Entry, bytes: &[u8]) -> Object {
+    let text = String::from_utf8_lossy(bytes);
+    let named: Value = serde_saphyr::from_str(&text).unwrap_or_default();
+    let text = |field: &str, other: &str| {
+        Some(named["metadata"][field].as_str().unwrap_or(other).to_owned())
+    };
+    let (name, namespace) = (text("name", "t"), text("namespace", "default"));
+    Object { entry, namespace, name, subresource: None }
+}
+
+/// Trees of fields, as a client may send them back.
+#[test]
+fn owners_are_read_as_they_are_written() {
+    let inputs = muster_hostile::inputs("apply");
+    muster_hostile::feed(bolero::check!(), inputs, |bytes| {
+        let Ok(list) = body::parse(bytes) else { return };
+        let read = |list: &Value| owners::of(&json!({"metadata": {"managedFields": list}}));
+        if let Some(owners) = read(&list) {
+            assert_eq!(read(&owners::write(&owners)), Some(owners));
         }
     });
 }

@@ -10,7 +10,7 @@ use rustls_pki_types::pem::PemObject as _;
 use serde::Deserialize;
 use serde_json::json;
 
-use super::enrol::{self, Candidate, Right};
+use super::enrol::{self, Candidate, Name, Right};
 use super::failure::Failure;
 use super::{Answer, Call, body, token};
 use crate::audit::Named;
@@ -52,8 +52,8 @@ pub(super) async fn join(call: Call) -> Answer {
     let session = session.and_then(|(live, node)| live.sessions.connection(&node));
     let speaking = session.as_ref().map(|session| &*session.key);
     let candidate = Candidate { node, kind, key: key_of(&certificate)?, shown, speaking };
-    let taken = enrol::check(&context, &candidate)?;
-    let right = right(&context, &asked, &asker.identity, taken).await?;
+    let name = enrol::check(&context, &candidate)?;
+    let right = right(&context, &asked, &asker.identity, (&candidate.key, name)).await?;
     enrol::enrol(&context, &candidate, right).await?;
     // Whoever spoke for the node until now has to show the key that counts; who renews a certificate goes on meanwhile.
     if right != Right::Renewal
@@ -76,10 +76,10 @@ async fn right(
     context: &Context,
     asked: &Request,
     identity: &Identity,
-    taken: bool,
+    (key, name): (&str, Name),
 ) -> Result<Right, Failure> {
     match (&asked.token, identity) {
-        (Some(text), _) => token::spend(context, text, &asked.node_name, taken).await,
+        (Some(text), _) => token::spend(context, text, (&asked.node_name, key), name).await,
         (None, Identity::Node { name, .. }) if *name == asked.node_name => Ok(Right::Renewal),
         (None, _) => {
             Err(Failure::unauthorized("a join token is needed, or the node's own certificate"))

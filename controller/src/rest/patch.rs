@@ -89,7 +89,11 @@ pub(super) async fn server_side(
 }
 
 /// What is applied: one object, in YAML (JSON is YAML), of the kind and name that the path has.
-fn configuration(shown: &Entry, target: &Object, bytes: &Bytes) -> Result<Value, Failure> {
+pub(super) fn configuration(
+    shown: &Entry,
+    target: &Object,
+    bytes: &Bytes,
+) -> Result<Value, Failure> {
     let text = std::str::from_utf8(bytes)
         .map_err(|_| Failure::bad_request("the body is not text in UTF-8"))?;
     let mut config: Value = serde_saphyr::from_str(text)

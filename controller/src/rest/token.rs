@@ -11,7 +11,7 @@ use ring::rand::SecureRandom as _;
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
-use super::enrol::{self, Right};
+use super::enrol::{self, Name, Right};
 use super::failure::Failure;
 use super::path::Verb;
 use super::{Answer, Call, body};
@@ -49,6 +49,9 @@ struct Record {
     secret_sha256: String,
     expires: Timestamp,
     used: u32,
+    /// The key of the agent that used it last.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    used_by: Option<String>,
 }
 
 /// What tokens of both sorts have of an object's metadata.
@@ -172,6 +175,7 @@ pub async fn make(context: &Context, spec: TokenSpec) -> Result<NewlyMade, Failu
         secret_sha256: hash(&secret),
         expires,
         used: 0,
+        used_by: None,
     };
     let value = serde_json::to_value(&record).expect("texts and numbers serialize");
     let key = Key::cluster(TOKENS, id.as_str());
@@ -184,12 +188,13 @@ pub async fn make(context: &Context, spec: TokenSpec) -> Result<NewlyMade, Failu
     Ok(NewlyMade { token, id, expires })
 }
 
-/// Uses a token for `node`, or says why it does not hold. `taken`: an agent has joined as that node.
+/// Uses a token for an agent, or says why it does not hold. One that asks again with the same key, because an answer did not
+/// reach it, uses it once. `name`: what the node's is to it.
 pub(super) async fn spend(
     context: &Context,
     token: &str,
-    node: &str,
-    taken: bool,
+    (node, key): (&str, &str),
+    name: Name,
 ) -> Result<Right, Failure> {
     let parts: Vec<&str> = token.trim().split('.').collect();
     let &[PREFIX, id, secret, ca] = &parts[..] else {
@@ -199,8 +204,8 @@ pub(super) async fn spend(
         return Err(refused("it was made by another controller"));
     }
     let now = context.clock.now();
-    let key = Key::cluster(TOKENS, id);
-    let spent = context.store.update(&key, |_, value| {
+    let token = Key::cluster(TOKENS, id);
+    let spent = context.store.update(&token, |_, value| {
         let mut record: Record =
             serde_json::from_value(value).map_err(|_| refused("its record is damaged"))?;
         if !same(record.secret_sha256.as_bytes(), hash(secret).as_bytes()) {
@@ -213,13 +218,17 @@ pub(super) async fn spend(
         if record.spec.node_name.as_deref().is_some_and(|only| only != node) {
             return Err(refused("it is for another node"));
         }
+        if name == Name::Own || record.used_by.as_deref() == Some(key) {
+            return Ok(None);
+        }
         if record.spec.uses.is_some_and(|uses| record.used >= uses) {
             return Err(refused("it is used up"));
         }
-        if taken && record.spec.node_name.is_none() {
+        if name == Name::Taken && record.spec.node_name.is_none() {
             return Err(enrol::taken(node));
         }
         record.used += 1;
+        record.used_by = Some(key.to_owned());
         Ok(Some(serde_json::to_value(&record).expect("texts and numbers serialize")))
     });
     match spent.await {
@@ -321,11 +330,11 @@ pub(super) mod tests {
         let (context, clock) = context(&dir).await;
         let spec = TokenSpec { ttl_seconds: Some(60), ..TokenSpec::default() };
         let made = make(&context, spec).await.unwrap();
-        spend(&context, &made.token, "a", false).await.unwrap();
+        spend(&context, &made.token, ("a", "1"), Name::Free).await.unwrap();
         clock.advance(59);
-        spend(&context, &made.token, "b", false).await.unwrap();
+        spend(&context, &made.token, ("b", "2"), Name::Free).await.unwrap();
         clock.advance(1);
-        let refused = spend(&context, &made.token, "c", false).await.unwrap_err();
+        let refused = spend(&context, &made.token, ("c", "3"), Name::Free).await.unwrap_err();
         assert_eq!(refused.code(), 401);
         assert!(refused.message().contains("expired at 2026-11-22T12:01:00Z"), "{refused:?}");
     }
@@ -337,11 +346,18 @@ pub(super) mod tests {
         let spec = TokenSpec { uses: Some(1), ..TokenSpec::default() };
         let made = make(&context, spec).await.unwrap();
         let tries = (0..8).map(|n| {
-            let (context, token) = (&context, made.token.as_str());
-            async move { spend(context, token, &format!("n{n}"), false).await }
+            let (context, token, key) = (&context, made.token.as_str(), format!("key {n}"));
+            async move { spend(context, token, (&format!("n{n}"), &key), Name::Free).await }
         });
         let outcomes = futures::future::join_all(tries).await;
-        assert_eq!(outcomes.iter().filter(|outcome| outcome.is_ok()).count(), 1);
+        let used: Vec<usize> = (0..8).filter(|n| outcomes[*n].is_ok()).collect();
+        assert_eq!(used.len(), 1);
+        // Who used it, and did not hear so, asks again: it is used once still.
+        for n in 0..8 {
+            let asks = (&*format!("n{n}"), &*format!("key {n}"));
+            let again = spend(&context, &made.token, asks, Name::Free).await;
+            assert_eq!(again.is_ok(), used == [n], "{again:?}");
+        }
     }
 
     #[tokio::test]

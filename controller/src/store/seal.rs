@@ -16,6 +16,7 @@ use std::path::{Path, PathBuf};
 
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
+use muster_failpoint::{Failpoint, Step, reach};
 use ring::aead::{AES_256_GCM, Aad, LessSafeKey, NONCE_LEN, Nonce, UnboundKey};
 use ring::digest;
 use ring::rand::{SecureRandom as _, SystemRandom};
@@ -233,13 +234,18 @@ fn make(path: &Path) -> Result<(), SealError> {
     );
     let tmp = path.with_extension("new");
     let mut options = OpenOptions::new();
+    reach(Failpoint::EncryptionKey, Step::Before);
     let file = options.write(true).create(true).truncate(true).mode(0o600).open(&tmp);
     let mut file = file.map_err(failed)?;
+    reach(Failpoint::EncryptionKey, Step::Created);
     file.write_all(text.as_bytes()).and_then(|()| file.sync_all()).map_err(failed)?;
+    reach(Failpoint::EncryptionKey, Step::Written);
     fs::rename(&tmp, path).map_err(failed)?;
     let dir = path.parent().filter(|dir| !dir.as_os_str().is_empty());
     let dir = dir.unwrap_or_else(|| Path::new("."));
-    fs::File::open(dir).and_then(|dir| dir.sync_all()).map_err(failed)
+    fs::File::open(dir).and_then(|dir| dir.sync_all()).map_err(failed)?;
+    reach(Failpoint::EncryptionKey, Step::After);
+    Ok(())
 }
 
 #[cfg(test)]

@@ -13,6 +13,7 @@ use std::time::Duration;
 
 use futures::future::BoxFuture;
 use futures::{FutureExt as _, TryStreamExt as _};
+use muster_failpoint::{Failpoint, Step, reach};
 use sqlx::migrate::{MigrateError, Migration, MigrationType, Migrator};
 use sqlx::sqlite::{SqliteConnectOptions, SqliteConnection, SqliteJournalMode, SqliteSynchronous};
 use sqlx::{ConnectOptions as _, Connection as _, Row as _, SqlSafeStr as _};
@@ -123,7 +124,7 @@ async fn has_sealed(connection: &mut SqliteConnection) -> Result<bool, sqlx::Err
 }
 
 impl Sqlite {
-    /// Writes rows anew that were sealed with an older key, and leaves nothing of the older form behind.
+    /// Writes rows anew that were sealed with an older key.
     async fn reseal(&mut self, mut rows: Vec<(i64, String)>) -> Result<(), BackendError> {
         if rows.is_empty() {
             return Ok(());
@@ -142,9 +143,10 @@ impl Sqlite {
                 let update = sqlx::query("UPDATE kv SET value = ? WHERE revision = ?");
                 update.bind(value).bind(revision).execute(&mut *transaction).await?;
             }
+            reach(Failpoint::StoreReseal, Step::Before);
             transaction.commit().await?;
+            reach(Failpoint::StoreReseal, Step::After);
         }
-        sqlx::query("PRAGMA wal_checkpoint(TRUNCATE)").execute(&mut *connection).await?;
         sqlx::query("PRAGMA secure_delete = OFF").execute(connection).await?;
         Ok(())
     }
@@ -213,6 +215,9 @@ impl Backend for Sqlite {
             }
             drop(rows);
             self.reseal(old).await?;
+            // The log still has the rows as they were, also of a life that was killed before it came to this.
+            let connection = self.connection().await?;
+            sqlx::query("PRAGMA wal_checkpoint(TRUNCATE)").execute(&mut *connection).await?;
             let compacted = sqlx::query("SELECT value FROM meta WHERE name = 'compacted'")
                 .fetch_one(self.connection().await?)
                 .await?;

@@ -5,6 +5,7 @@
 
 use std::sync::{Arc, PoisonError, RwLock};
 
+use muster_failpoint::{Failpoint, Step, reach};
 use tokio::sync::{mpsc, oneshot, watch};
 use tokio_util::sync::CancellationToken;
 
@@ -147,7 +148,18 @@ impl Writer {
         let compaction = self.compaction(!compacting.is_empty());
         let batch = Batch { events: &pending.events, compaction: compaction.as_ref() };
         let nothing = pending.events.is_empty() && compaction.is_none();
+        let points = [
+            (Failpoint::StoreCommit, !pending.events.is_empty()),
+            (Failpoint::StoreCompaction, compaction.is_some()),
+        ];
+        let reach_all = |step| {
+            for (point, _) in points.iter().filter(|(_, happens)| *happens) {
+                reach(*point, step);
+            }
+        };
+        reach_all(Step::Before);
         let committed = if nothing { Ok(()) } else { self.backend.commit(batch).await };
+        reach_all(Step::After);
         match committed {
             Ok(()) => {
                 self.publish(pending.events);

@@ -23,6 +23,8 @@ mod place;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
+use muster_failpoint::{Failpoint, Step, reach};
+
 use crate::runtime::Limits;
 use group::Group;
 use hierarchy::{Hierarchy, HierarchyError};
@@ -108,13 +110,16 @@ impl Enforcer for Kernel {
 
     fn make(&self, name: &str, limits: &Limits, disk: &Path) -> Result<Group, LimitError> {
         let group = self.group(name);
+        reach(Failpoint::Group, Step::Before);
         group.create().map_err(|source| LimitError::Create { name: name.to_owned(), source })?;
+        reach(Failpoint::Group, Step::Half);
         let made = limits::apply(&group, limits, disk);
         if let Err(error) = made {
             // Nothing entered it yet; a failure to remove it is left to the next sweep.
             let _ = group.remove();
             return Err(error);
         }
+        reach(Failpoint::Group, Step::After);
         Ok(group)
     }
 

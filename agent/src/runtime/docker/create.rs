@@ -1,6 +1,8 @@
 //! A launch as the engine wants it.
 
 use std::collections::HashMap;
+use std::fs;
+use std::io;
 use std::path::Path;
 
 use bollard::models::{
@@ -23,13 +25,19 @@ pub(super) const LABEL_UID: &str = "muster.dev/task-uid";
 /// Which attempt of the task it is.
 pub(super) const LABEL_ATTEMPT: &str = "muster.dev/attempt";
 
-/// Where a container sees its task's run directory.
-const RUN_DIR: &str = "/run/muster";
+/// Where a container finds what is the agent's to write: places for the two below, and nothing else.
+const VIEW_DIR: &str = "/run/muster";
+
+/// The directory that is mounted there, in its task's.
+const VIEW: &str = "view";
+
+/// Where a container sees its task's run directory, which is its own to write.
+const RUN_DIR: &str = "/run/muster/own";
 
 /// Where a container sees the directory of its executor socket.
 const EXECUTOR_DIR: &str = "/run/muster-executor";
 
-/// Where a container finds its sensors' sockets, in its run directory.
+/// Where a container finds its sensors' sockets.
 const SENSORS_DIR: &str = "/run/muster/sensors";
 
 /// Where a container finds the gate's socket.
@@ -51,23 +59,7 @@ pub(super) fn body(launch: &Launch, config: &DockerConfig) -> Result<ContainerCr
         let message = "the launch is no container's".to_owned();
         return Err(Failure { reason: "NodeError".to_owned(), message, retry: false });
     };
-    let run_dir = config.tasks.join(launch.id.uid.as_str()).join("run");
-    std::fs::create_dir_all(&run_dir).map_err(|error| Failure {
-        reason: "NodeError".to_owned(),
-        message: format!("failed to make {}: {error}", run_dir.display()),
-        retry: true,
-    })?;
-    if let Some((uid, gid)) = container.user {
-        match std::os::unix::fs::chown(&run_dir, Some(uid), Some(gid)) {
-            // Of an agent that is not root: the program runs, and cannot write there.
-            Err(error) if error.kind() == std::io::ErrorKind::PermissionDenied => {}
-            done => done.map_err(|error| Failure {
-                reason: "NodeError".to_owned(),
-                message: format!("failed to hand over {}: {error}", run_dir.display()),
-                retry: true,
-            })?,
-        }
-    }
+    make_dirs(launch, container, config)?;
     let mut env = launch.env.clone();
     env.insert("MUSTER_RUN_DIR".to_owned(), RUN_DIR.to_owned());
     let socket = format!("{EXECUTOR_DIR}/{}", executor::SOCKET);
@@ -90,9 +82,35 @@ pub(super) fn body(launch: &Launch, config: &DockerConfig) -> Result<ContainerCr
         user: container.run_as.clone(),
         env: Some(env.iter().map(|(name, value)| format!("{name}={value}")).collect()),
         labels: Some(labels(launch, config)),
-        host_config: Some(host(launch, container, config, &run_dir.display().to_string())?),
+        host_config: Some(host(launch, container, config)?),
         ..ContainerCreateBody::default()
     })
+}
+
+/// Where the task writes, and what it sees around that.
+fn make_dirs(launch: &Launch, container: &Container, config: &DockerConfig) -> Result<(), Failure> {
+    let failed = |what: &'static str, path: &Path| {
+        let path = path.to_owned();
+        move |error: io::Error| Failure {
+            reason: "NodeError".to_owned(),
+            message: format!("failed to {what} {}: {error}", path.display()),
+            retry: true,
+        }
+    };
+    let task = config.tasks.join(launch.id.uid.as_str());
+    let (run, view) = (task.join("run"), task.join(VIEW));
+    let places = [RUN_DIR, SENSORS_DIR].into_iter().filter_map(|place| {
+        Path::new(place).strip_prefix(VIEW_DIR).ok().map(|place| view.join(place))
+    });
+    for dir in places.chain([run.clone()]) {
+        fs::create_dir_all(&dir).map_err(failed("make", &dir))?;
+    }
+    let Some((uid, gid)) = container.user else { return Ok(()) };
+    match std::os::unix::fs::chown(&run, Some(uid), Some(gid)) {
+        // Of an agent that is not root: the program runs, and cannot write there.
+        Err(error) if error.kind() == io::ErrorKind::PermissionDenied => Ok(()),
+        done => done.map_err(failed("hand over", &run)),
+    }
 }
 
 fn labels(launch: &Launch, config: &DockerConfig) -> HashMap<String, String> {
@@ -107,13 +125,16 @@ fn host(
     launch: &Launch,
     container: &Container,
     config: &DockerConfig,
-    run_dir: &str,
 ) -> Result<HostConfig, Failure> {
     let limits = &launch.limits;
     let sizes = update(limits);
-    let mut mounts = vec![mount(run_dir, RUN_DIR, false)];
+    let task = config.tasks.join(launch.id.uid.as_str());
+    let mut mounts = vec![
+        mount(&task.join(VIEW).display().to_string(), VIEW_DIR, true),
+        mount(&task.join("run").display().to_string(), RUN_DIR, false),
+    ];
     // The directory, not the socket: another life of the agent makes that anew.
-    let seat = config.tasks.join(launch.id.uid.as_str()).join(executor::DIR);
+    let seat = task.join(executor::DIR);
     if seat.exists() {
         mounts.push(mount(&seat.display().to_string(), EXECUTOR_DIR, true));
     }

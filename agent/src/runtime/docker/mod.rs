@@ -39,6 +39,7 @@ use muster_agent_core::desired::StopTimes;
 use muster_agent_core::observed::{End, Exit, Loss, Observed, Started};
 use muster_agent_core::workload::Failure;
 use muster_api::id::TaskUid;
+use muster_failpoint::{Failpoint, Step, reach};
 use tokio::sync::Notify;
 
 use super::cgroup::group::Group;
@@ -183,6 +184,7 @@ impl DockerRuntime {
             let _ = self.remove_container(&docker, &self.name(&old)).await;
         }
         let options = CreateContainerOptionsBuilder::new().name(&name).build();
+        reach(Failpoint::ContainerCreation, Step::Before);
         if let Err(error) = docker.create_container(Some(options), body).await {
             return match inspect::refusal(&error) {
                 Some((409, _)) => Launched::Unclear(RuntimeError::new("create a container", error)),
@@ -195,6 +197,7 @@ impl DockerRuntime {
                 None => Launched::Unclear(RuntimeError::new("create a container", error)),
             };
         }
+        reach(Failpoint::ContainerCreation, Step::After);
         self.start(&docker, &name, launch).await
     }
 
@@ -215,6 +218,7 @@ impl DockerRuntime {
     }
 
     async fn start(&self, docker: &Docker, name: &str, launch: &Launch) -> Launched {
+        reach(Failpoint::ContainerStart, Step::Before);
         if let Err(error) = docker.start_container(name, None).await {
             return match inspect::refusal(&error) {
                 // The engine's words: a program that is not there, a mount that is not, …
@@ -222,6 +226,7 @@ impl DockerRuntime {
                 None => Launched::Unclear(RuntimeError::new("start a container", error)),
             };
         }
+        reach(Failpoint::ContainerStart, Step::After);
         if launch.stop_after_ms.is_some() {
             // Before the task is said to run: it must not run a moment that nobody would end.
             if let Err(error) = self.guard(docker, launch).await {
@@ -385,12 +390,15 @@ impl DockerRuntime {
 
     async fn remove_container(&self, docker: &Docker, name: &str) -> Result<(), RuntimeError> {
         let options = RemoveContainerOptionsBuilder::new().force(true).v(true).build();
+        reach(Failpoint::ContainerRemoval, Step::Before);
         match docker.remove_container(name, Some(options)).await {
             Err(error) if !inspect::is_missing(&error) => {
-                Err(RuntimeError::new("remove a container", error))
+                return Err(RuntimeError::new("remove a container", error));
             }
-            _ => Ok(()),
+            _ => {}
         }
+        reach(Failpoint::ContainerRemoval, Step::After);
+        Ok(())
     }
 
     async fn remove(&self, uid: &TaskUid) -> Result<(), RuntimeError> {

@@ -19,7 +19,8 @@ use std::os::fd::AsFd;
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 
-use muster_agent_core::observed::Exit;
+use muster_agent_core::observed::{End, Exit, Loss};
+use muster_failpoint::Failpoint;
 use rustix::fs::FlockOperation;
 use serde::{Deserialize, Serialize};
 
@@ -115,7 +116,9 @@ impl AttemptDir {
     }
 
     pub(crate) fn write_order(&self, order: &Order) -> Result<(), FileError> {
-        durable::write_json(&self.0.join("launch.json"), order, Keep::Crash)
+        let point =
+            if order.guarded.is_some() { Failpoint::GuardOrder } else { Failpoint::ShimOrder };
+        durable::write_json(point, &self.0.join("launch.json"), order, Keep::Crash)
     }
 
     pub(crate) fn order(&self) -> Result<Option<Order>, FileError> {
@@ -123,7 +126,7 @@ impl AttemptDir {
     }
 
     pub(crate) fn write_begun(&self, begun: &Begun) -> Result<(), FileError> {
-        durable::write_json(&self.0.join("begun.json"), begun, Keep::Crash)
+        durable::write_json(Failpoint::ShimBegun, &self.0.join("begun.json"), begun, Keep::Crash)
     }
 
     pub(crate) fn begun(&self) -> Result<Option<Begun>, FileError> {
@@ -131,7 +134,12 @@ impl AttemptDir {
     }
 
     pub(crate) fn write_running(&self, running: &Running) -> Result<(), FileError> {
-        durable::write_json(&self.0.join("started.json"), running, Keep::Crash)
+        durable::write_json(
+            Failpoint::ShimStarted,
+            &self.0.join("started.json"),
+            running,
+            Keep::Crash,
+        )
     }
 
     pub(crate) fn running(&self) -> Result<Option<Running>, FileError> {
@@ -139,7 +147,7 @@ impl AttemptDir {
     }
 
     pub(crate) fn write_stop(&self, stop: StopFile) -> Result<(), FileError> {
-        durable::write_json(&self.0.join("stop.json"), &stop, Keep::Crash)
+        durable::write_json(Failpoint::StopOrder, &self.0.join("stop.json"), &stop, Keep::Crash)
     }
 
     pub(crate) fn stop(&self) -> Result<Option<StopFile>, FileError> {
@@ -148,7 +156,13 @@ impl AttemptDir {
 
     /// Says that the attempt was ended for want of contact.
     pub(crate) fn write_disconnected(&self) -> Result<(), FileError> {
-        durable::write(&self.0.join("disconnected"), b"", 0o600, Keep::PowerCut)
+        durable::write(
+            Failpoint::Disconnected,
+            &self.0.join("disconnected"),
+            b"",
+            0o600,
+            Keep::PowerCut,
+        )
     }
 
     pub(crate) fn was_disconnected(&self) -> bool {
@@ -156,7 +170,10 @@ impl AttemptDir {
     }
 
     pub(crate) fn write_exit(&self, exit: &Exit) -> Result<(), FileError> {
-        durable::write_json(&self.0.join("exit.json"), exit, Keep::PowerCut)
+        // Of a shim that is lost the agent writes it.
+        let lost = exit.end == End::Lost(Loss::Shim);
+        let point = if lost { Failpoint::LostShimExit } else { Failpoint::ShimExit };
+        durable::write_json(point, &self.0.join("exit.json"), exit, Keep::PowerCut)
     }
 
     pub(crate) fn exit(&self) -> Result<Option<Exit>, FileError> {

@@ -46,6 +46,7 @@ use muster_agent_core::desired::StopTimes;
 use muster_agent_core::observed::{End, Exit, Loss, Observed, Started};
 use muster_agent_core::workload::Failure;
 use muster_api::id::TaskUid;
+use muster_failpoint::{Failpoint, Step, reach};
 use rustix::process::{PidfdFlags, Signal, WaitId, WaitIdOptions};
 use tokio::io::AsyncReadExt;
 use tokio::io::unix::AsyncFd;
@@ -311,6 +312,7 @@ impl ProcessRuntime {
 
     fn remove(&self, uid: &TaskUid) -> Result<(), RuntimeError> {
         let task = self.0.config.tasks.join(uid.as_str());
+        reach(Failpoint::AttemptsRemoval, Step::Before);
         for part in ["attempts", "work", "run"] {
             let path = task.join(part);
             match fs::remove_dir_all(&path) {
@@ -321,6 +323,7 @@ impl ProcessRuntime {
                 _ => {}
             }
         }
+        reach(Failpoint::AttemptsRemoval, Step::After);
         Ok(())
     }
 }

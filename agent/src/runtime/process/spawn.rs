@@ -11,6 +11,7 @@ use std::process::{Child, Command, Stdio};
 use std::sync::Arc;
 
 use muster_agent_core::workload::Failure;
+use muster_failpoint::{Failpoint, Step, reach};
 use rustix::fs::{MemfdFlags, memfd_create};
 use rustix::pipe::PipeFlags;
 
@@ -46,7 +47,9 @@ fn files(error: &FileError) -> SpawnError {
 }
 
 pub(super) fn spawn(inner: &Inner, mut launch: Launch) -> Result<Spawned, SpawnError> {
+    reach(Failpoint::AttemptDirs, Step::Before);
     let dir = make_dirs(inner, &launch).map_err(|error| files(&error))?;
+    reach(Failpoint::AttemptDirs, Step::After);
     let lock = match dir.lock() {
         Ok(Some(lock)) => lock,
         Ok(None) => return Err(unclear("lock an attempt", "a shim of this attempt lives")),
@@ -80,10 +83,12 @@ pub(super) fn spawn(inner: &Inner, mut launch: Launch) -> Result<Spawned, SpawnE
         .map_err(|errno| give_up(refused("NodeError", format!("no pipe: {errno}"), true)))?;
     // Only the reading end may refuse to wait.
     let _ = rustix::io::ioctl_fionbio(&child_word, false);
+    reach(Failpoint::ShimStart, Step::Before);
     let child =
         spawn_shim(&inner.config.reexec, &dir, &lock, (given, child_word)).map_err(|error| {
             give_up(refused("NodeError", format!("failed to start a shim: {error}"), true))
         })?;
+    reach(Failpoint::ShimStart, Step::After);
     // From here on the shim holds the lock as well.
     drop(lock);
     let pid = child.id().cast_signed();

@@ -4,6 +4,7 @@
 //! `x-kubernetes-list-map-keys`. Where there is no schema, as under `data` of a work, maps go by key and lists whole.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::sync::LazyLock;
 
 use serde_json::{Map, Value};
 
@@ -24,6 +25,9 @@ enum Shape<'s> {
     /// Not at all.
     Whole,
 }
+
+/// A map in which there is nothing.
+static NOTHING: LazyLock<Value> = LazyLock::new(|| Value::Object(Map::new()));
 
 /// Nothing is known.
 const NO_SCHEMA: &Value = &Value::Null;
@@ -96,7 +100,10 @@ pub fn leaves<'a>(schema: &Value, value: &'a Value) -> Leaves<'a> {
 fn collect<'a>(schema: &Value, value: &'a Value, at: &Path, leaves: &mut Leaves<'a>) {
     match (shape(schema, value), value) {
         (_, Value::Null) => {}
-        (Shape::Fields(schema), Value::Object(members)) if !members.is_empty() => {
+        (Shape::Fields(_), Value::Object(members)) if members.values().all(Value::is_null) => {
+            leaves.insert(at.clone(), Some(&NOTHING));
+        }
+        (Shape::Fields(schema), Value::Object(members)) => {
             for (name, member) in members {
                 let at = at.then(Step::Field(name.clone()));
                 collect(field(schema, name), member, &at, leaves);

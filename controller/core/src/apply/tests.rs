@@ -37,6 +37,18 @@ fn fields(owners: &Owners, name: &str, operation: Operation) -> Value {
 }
 
 #[test]
+fn a_map_of_nothing_but_nulls_is_an_empty_one() {
+    let config = json!({"spec": {"replicas": null}});
+    let (object, owners) = applied(&json!({}), &Owners::new(), "a", &config, false).unwrap();
+    assert_eq!(object, json!({"spec": {}}));
+    assert_eq!(fields(&owners, "a", Operation::Apply), json!({"f:spec": {}}));
+    let others = json!({"spec": {}});
+    let (same, owners) = applied(&object, &owners, "b", &others, false).expect("they agree");
+    let (gone, _) = applied(&same, &owners, "b", &json!({}), false).unwrap();
+    assert_eq!((same, gone), (object.clone(), object), "it is a's still");
+}
+
+#[test]
 fn fields_are_written_as_kubernetes_writes_them() {
     let config = json!({
         "metadata": {"labels": {"app": "x"}},

@@ -142,7 +142,7 @@ impl House {
         let mut cluster = Cluster::start_at(&format!("{ADDRESS}:0"), &[]).await;
         let (disk, clock) = (Disk::new(), Clock::new(cluster.dir().join("controller.clock")));
         for (name, value) in clock.env() {
-            cluster.set_env(name, &value);
+            cluster.set_variable("controller", name, Some(&value));
         }
         cluster.kill_controller();
         move_data(&mut cluster, disk.path().join("controller"));
@@ -187,7 +187,9 @@ impl House {
             options = options.clone().flag("--config", &config.display().to_string());
             heard
         });
-        options.env.extend(clock.env().map(|(name, value)| (name.to_owned(), value)));
+        for (variable, value) in clock.env() {
+            self.cluster.set_variable(name, variable, Some(&value));
+        }
         options.data_dir = disk.as_ref().map(|disk| disk.path().join("agent"));
         options.namespace = Some(namespace);
         self.cluster.join(options).await;
