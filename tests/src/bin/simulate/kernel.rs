@@ -20,6 +20,8 @@ pub(crate) struct Program {
     pub(crate) grace_ms: u64,
     /// It may run so long without contact, milliseconds.
     pub(crate) stop_after_ms: Option<u64>,
+    /// It ends by itself, soon and badly.
+    pub(crate) crashes: bool,
     /// Tasks that must have come so far before it begins.
     pub(crate) waits_for: Vec<(String, DependencyCondition)>,
 }

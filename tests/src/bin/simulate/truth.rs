@@ -1,8 +1,9 @@
 //! What really runs: the kernels of all machines together, as no part of muster sees them. The invariants are held against
 //! this, at every start of a process.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
+use muster_agent_core::gate::{Relation, Token};
 use muster_agent_core::observed::Exit;
 use muster_api::id::TaskUid;
 use muster_api::kind::task::depend::DependencyCondition;
@@ -12,8 +13,8 @@ use crate::invariant::{Invariant, Violation};
 /// What a process takes of its node.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Takes {
-    /// It may drive the robot.
-    pub(crate) drives: bool,
+    /// It may drive the robot, by the grant of this number.
+    pub(crate) drives: Option<u64>,
     /// Millicores.
     pub(crate) cpu: u64,
     /// Bytes.
@@ -57,10 +58,37 @@ pub(crate) struct Room {
     pub(crate) memory: u64,
 }
 
-/// Every process that was ever started.
+/// A command that a driver was handed.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct Command {
+    pub(crate) task: TaskUid,
+    pub(crate) token: Token,
+}
+
+/// One that began to drive while another could: right only if a person had taken the robot from the older one.
+#[derive(Debug)]
+pub(crate) struct Beside {
+    pub(crate) node: usize,
+    /// The grant of the older one.
+    pub(crate) older: u64,
+    pub(crate) how: String,
+}
+
+/// Every process that was ever started, and every command that passed.
 #[derive(Debug, Default)]
 pub(crate) struct Truth {
-    pub(crate) rooms: Vec<Room>,
+    rooms: Vec<Room>,
+    /// No program ends by itself any more, but those that must.
+    pub(crate) calm: bool,
+    /// Which nodes have a gate.
+    gated: Vec<bool>,
+    /// The newest command of each robot.
+    commands: BTreeMap<usize, Command>,
+    /// The newest grant of each robot that a person was told is theirs.
+    persons: BTreeMap<usize, u64>,
+    /// Tasks of nodes that a person called off: he may have erred, and what they do is his.
+    pub(crate) written_off: BTreeSet<TaskUid>,
+    pub(crate) beside: Vec<Beside>,
     /// Every task that ever began; no name is used twice.
     pub(crate) names: BTreeMap<String, TaskUid>,
     pub(crate) live: BTreeMap<TaskUid, Live>,
@@ -72,6 +100,11 @@ pub(crate) struct Truth {
 }
 
 impl Truth {
+    /// By node what it has, and whether it has a gate.
+    pub(crate) fn new(rooms: Vec<Room>, gated: Vec<bool>) -> Truth {
+        Truth { rooms, gated, ..Truth::default() }
+    }
+
     /// A process begins.
     ///
     /// # Errors
@@ -98,15 +131,7 @@ impl Truth {
                 )));
             }
         }
-        if live.takes.drives
-            && let Some((driver, other)) =
-                self.live.iter().find(|(_, other)| other.node == live.node && other.takes.drives)
-        {
-            return Err(Invariant::OneDriver.broken(format!(
-                "node {}: attempt {} of {uid} begins to drive while attempt {} of {driver} does",
-                live.node, live.attempt, other.attempt
-            )));
-        }
+        self.begins_to_drive(uid, &live)?;
         let here = self.live.values().filter(|other| other.node == live.node);
         let (cpu, memory) = here
             .fold((live.takes.cpu, live.takes.memory), |(cpu, memory), other| {
@@ -120,6 +145,79 @@ impl Truth {
             )));
         }
         self.live.insert(uid.clone(), live);
+        Ok(())
+    }
+
+    /// Who has the actuators is alone with them, but for those from whom a person took them.
+    fn begins_to_drive(&mut self, uid: &TaskUid, live: &Live) -> Result<(), Violation> {
+        let Some(epoch) = live.takes.drives else { return Ok(()) };
+        let drives = |other: &Live| other.takes.drives.filter(|_| other.node == live.node);
+        let others = self.live.iter().filter_map(|(uid, other)| Some((uid, drives(other)?)));
+        for (driver, other) in others {
+            let how = format!(
+                "node {}: {uid} ({epoch}) begins to drive while {driver} ({other}) does",
+                live.node
+            );
+            self.beside.push(Beside { node: live.node, older: epoch.min(other), how });
+        }
+        self.is_alone(live.node, uid, epoch)
+    }
+
+    /// Where no gate stands before the drivers, whoever lives drives.
+    fn is_alone(&self, node: usize, uid: &TaskUid, epoch: u64) -> Result<(), Violation> {
+        match self.gated[node] {
+            true => Ok(()),
+            false => self.is_no_persons(node, uid, epoch),
+        }
+    }
+
+    fn is_no_persons(&self, node: usize, uid: &TaskUid, epoch: u64) -> Result<(), Violation> {
+        let person = self.persons.get(&node).copied().unwrap_or(0);
+        if epoch >= person || self.written_off.contains(uid) {
+            return Ok(());
+        }
+        let how = format!(
+            "node {node}: {uid} drives by grant {epoch}, and a person was told that {person} counts"
+        );
+        Err(Invariant::OneDriver.broken(how))
+    }
+
+    /// A person was told that this grant is theirs.
+    ///
+    /// # Errors
+    ///
+    /// Somebody drives against it.
+    pub(crate) fn person_holds(&mut self, node: usize, epoch: u64) -> Result<(), Violation> {
+        let known = self.persons.entry(node).or_default();
+        *known = epoch.max(*known);
+        let here = self.live.iter().filter(|(_, live)| live.node == node);
+        here.filter_map(|(uid, live)| Some((uid, live.takes.drives?)))
+            .try_for_each(|(uid, epoch)| self.is_alone(node, uid, epoch))
+    }
+
+    /// A driver is handed a command.
+    ///
+    /// # Errors
+    ///
+    /// It is of somebody who may not command the robot any more.
+    pub(crate) fn is_commanded(&mut self, node: usize, command: Command) -> Result<(), Violation> {
+        let Command { task, token } = &command;
+        if self.live.get(task).is_none_or(|live| live.node != node) {
+            let how = format!("node {node}: a command of {task} passes, which does not live there");
+            return Err(Invariant::OneDriver.broken(how));
+        }
+        if let Some(last) = self.commands.get(&node) {
+            let older = matches!(token.relation(&last.token), Relation::Older | Relation::Super);
+            if older || (*token == last.token && *task != last.task) {
+                let how = format!(
+                    "node {node}: {task} commands with {token} after {} did with {}",
+                    last.task, last.token
+                );
+                return Err(Invariant::OneDriver.broken(how));
+            }
+        }
+        self.is_no_persons(node, task, token.epoch.0)?;
+        self.commands.insert(node, command);
         Ok(())
     }
 

@@ -10,8 +10,10 @@ use muster_agent_core::journal::Journal;
 use muster_agent_core::plan::{self, Step};
 use muster_agent_core::time::Boot;
 use muster_agent_core::workload::{Fetch, Workload};
+use muster_api::condition::{ACTUATORS_FENCED, Condition};
 use muster_api::id::TaskUid;
 use muster_api::kind::node::RuntimeStatus;
+use muster_api::name::FunctionName;
 use muster_api::pose::Pose;
 use muster_api::quantity::{Bytes, MilliCpu};
 use muster_api::resource::Compute;
@@ -20,6 +22,7 @@ use muster_api::wire::agent_session::NodeReport;
 use proto::agent_message::Body as Say;
 use proto::controller_message::Body as Hear;
 
+use super::gate::Hold;
 use super::{Agent, Cell, Hands, What};
 use crate::mutation::Mutation;
 use crate::net::{Conn, Down, Up};
@@ -43,6 +46,12 @@ pub(super) struct Session {
     beats: BTreeMap<u64, Boot>,
     beat: u64,
     last_heard: u64,
+    /// What it said of the node last, but for where that is.
+    node: proto::NodeState,
+}
+
+fn without_pose(state: &proto::NodeState) -> proto::NodeState {
+    proto::NodeState { pose: None, ..state.clone() }
 }
 
 impl Session {
@@ -64,7 +73,8 @@ impl Agent {
         }
         let conn = hands.net.open(self.index);
         let hello_at = self.clock(hands.now);
-        let state = Some(self.state(hands));
+        let state = self.state(hands);
+        let node = without_pose(&state);
         let Some(life) = &mut self.life else { return };
         let told = life.tasks.iter().filter_map(|(uid, cell)| Some((uid, cell.told.as_ref()?)));
         let hello: Vec<(TaskUid, u64)> =
@@ -73,7 +83,7 @@ impl Agent {
             node: self.member.name.to_string(),
             incarnation: format!("{}-{}", self.boot, self.lives),
             version: "simulated".to_owned(),
-            state,
+            state: Some(state),
             tasks: told.map(|(uid, report)| report_to_wire(uid, report)).collect(),
         };
         life.session = Some(Session {
@@ -86,6 +96,7 @@ impl Agent {
             beats: BTreeMap::new(),
             beat: 0,
             last_heard: hands.now,
+            node,
         });
         hands.net.send_up(conn, Up::Open, hands.now, (hands.dice, hands.agenda));
         self.say(Say::Hello(message), hands);
@@ -102,23 +113,48 @@ impl Agent {
             version: String::new(),
             message: String::new(),
         };
-        proto::NodeState::from(&NodeReport {
+        let hold = self.life.as_ref().map(|life| &life.hold);
+        let actuators: Vec<FunctionName> = functions(&self.actuators);
+        let (conditions, estop) = match (&self.gate, hold) {
+            (Some(_), Some(hold)) => {
+                (hold.standing().conditions(&actuators), hold.standing().estop())
+            }
+            _ if actuators.is_empty() => (Vec::new(), None),
+            _ => (vec![Condition::new(ACTUATORS_FENCED, false, "NoGate", String::new())], None),
+        };
+        let mut state = proto::NodeState::from(&NodeReport {
             kind: self.member.kind,
             labels: BTreeMap::new(),
             capacity: all.clone(),
             allocatable: all,
             sensors: functions(&self.sensors),
-            actuators: self.actuators.iter().filter_map(|text| text.parse().ok()).collect(),
+            actuators,
             pose: self.pose(),
             runtimes: vec![runtime],
-            conditions: Vec::new(),
+            conditions,
             speed: None,
             address: String::new(),
             battery: None,
             mission_locks: Vec::new(),
-            estop: None,
+            estop,
             images: Vec::new(),
-        })
+        });
+        state.person_epoch = hold.map_or(0, Hold::person_epoch);
+        state
+    }
+
+    /// Says what the node is, when that is news.
+    pub(super) fn say_node(&mut self, hands: &mut Hands<'_>) {
+        if !self.is_connected() {
+            return;
+        }
+        let state = self.state(hands);
+        let session = self.life.as_mut().and_then(|life| life.session.as_mut());
+        let Some(session) = session.filter(|session| session.node != without_pose(&state)) else {
+            return;
+        };
+        session.node = without_pose(&state);
+        self.say(Say::Node(state), hands);
     }
 
     fn pose(&self) -> Option<Pose> {
@@ -238,6 +274,9 @@ impl Agent {
 
     /// Something of the controller arrives.
     pub(crate) fn hear(&mut self, conn: Conn, what: Down, hands: &mut Hands<'_>) {
+        if self.hear_orders(conn, &what, hands) {
+            return;
+        }
         let session = self.life.as_mut().and_then(|life| life.session.as_mut());
         let Some(session) = session.filter(|session| session.conn == conn) else { return };
         session.last_heard = hands.now;
@@ -245,8 +284,8 @@ impl Agent {
         let body = match what {
             Down::End => return self.redial(begun, 0, hands),
             Down::Message(message) => message.body,
-            // To frameworks alone.
-            Down::Event(_) => return,
+            // On other connections.
+            Down::Event(_) | Down::Order(_) => return,
         };
         match body {
             Some(Hear::Welcome(welcome)) => {
@@ -262,6 +301,7 @@ impl Agent {
                     self.tell(&uid, Event::Tick, hands);
                 }
                 self.beat(conn, hands);
+                self.say_node(hands);
             }
             Some(Hear::Assignments(assignments)) => self.assign(assignments, hands),
             Some(Hear::Heartbeat(answer)) => {
@@ -289,7 +329,7 @@ impl Agent {
                 hands.truth.launched.insert(uid, framework.id.clone());
             }
         }
-        let keep = |wire: &proto::Assignment, spec| Agent::kept(&wire.name, &spec);
+        let keep = |wire: &proto::Assignment, spec| Agent::kept(wire, &spec);
         let (assignments, mut kept) = decode(message, |uid| life.tasks.contains_key(uid), keep);
         let known = life.tasks.iter().map(|(uid, cell)| (uid.clone(), cell.forgotten)).collect();
         let mut told = Vec::new();
