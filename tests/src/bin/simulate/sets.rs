@@ -240,7 +240,8 @@ impl Sets {
             // One that ended by itself meanwhile was not there any more.
             let live = truth.live.get(&served.uid).map(|live| live.attempt);
             let over = truth.over.get(&served.uid).filter(|over| over.cause == Cause::Order);
-            if live.or(over.map(|over| over.attempt)) == Some(served.attempt) {
+            let attempt = live.or_else(|| over.map(|over| over.attempt));
+            if attempt == Some(served.attempt) {
                 self.emptied.insert(place, served.uid.clone());
             }
         }
@@ -253,18 +254,21 @@ impl Sets {
         uid: &TaskUid,
         members: &[(&Key, &TaskUid, &Task)],
     ) -> Result<(), Violation> {
-        // Another one in its place may wait for room, and then the rollout goes on without it.
-        self.emptied.retain(|(set, name), was| {
-            let follows =
-                |(key, of, _): &(&Key, &TaskUid, &Task)| *key.name == **name && *of != was;
-            set != uid.as_str() || !members.iter().any(follows)
+        // Another one in its place may wait for room, and then the rollout goes on without it; and what was to make room for
+        // others did not serve any more.
+        let waits = |task: &Task| task.status.as_ref().is_some_and(|status| status.stop.is_none());
+        self.emptied.retain(|(set, _), was| {
+            let is = |(_, of, task): &(&Key, &TaskUid, &Task)| **of == *was && waits(task);
+            set != uid.as_str() || members.iter().any(is)
         });
-        let down = self.emptied.keys().filter(|(set, _)| set == uid.as_str()).count();
+        let here = self.emptied.keys().filter(|(set, _)| set == uid.as_str());
+        let down: Vec<&str> = here.map(|(_, name)| name.as_str()).collect();
         match self.wishes.get(uid.as_str()) {
-            Some(wish) if down > wish.most => {
-                let most = wish.most;
-                let how =
-                    format!("{key}: a rollout has {down} down that served, at most {most} may be");
+            Some(wish) if down.len() > wish.most => {
+                let (most, down) = (wish.most, down.join(", "));
+                let how = format!(
+                    "{key}: a rollout took {down} down, which served; at most {most} may be"
+                );
                 Err(Invariant::WorkOutlivesItsManagers.broken(how))
             }
             _ => Ok(()),

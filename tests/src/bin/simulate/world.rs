@@ -40,7 +40,7 @@ pub(crate) struct Cast {
 
 impl Cast {
     fn of(seed: u64) -> Cast {
-        Cast { sets: seed % 3 == 0 }
+        Cast { sets: seed.is_multiple_of(3) }
     }
 }
 

@@ -337,7 +337,7 @@ impl Agent {
         let Some(hall) = &mut gate.hall else { return };
         if full {
             // The newest is written at the next try.
-            hall.record.writing = hall.record.next.take().or(hall.record.writing.take());
+            hall.record.writing = hall.record.next.take().or_else(|| hall.record.writing.take());
             return hands.later(self.index, WRITE_AGAIN, WRITE_AGAIN, What::GateWritten(number));
         }
         let Some(kept) = hall.record.writing.take() else { return };
