@@ -57,6 +57,11 @@ pub(crate) enum Action {
     ScaleSet,
     ChangeSet,
     DeleteSet,
+    /// Somebody wants an application, another policy of it, or it gone; what its part tells is not as it should be.
+    CreateApplication,
+    ChangeApplication,
+    DeleteApplication,
+    Violate,
     /// A framework launches, declines, ends a task, asks for the state of all.
     Accept,
     Decline,
@@ -118,6 +123,14 @@ const OF_SETS: [(Action, u64); 4] = [
     (Action::DeleteSet, 3),
 ];
 
+/// The same of applications.
+const OF_APPLICATIONS: [(Action, u64); 4] = [
+    (Action::CreateApplication, 30),
+    (Action::ChangeApplication, 6),
+    (Action::DeleteApplication, 2),
+    (Action::Violate, 16),
+];
+
 /// What was done.
 #[derive(Debug, Default, Clone)]
 pub(crate) struct Tally {
@@ -133,7 +146,8 @@ const OTHERS: usize = 5;
 impl Action {
     pub(crate) fn drawn(dice: &mut Dice, cast: Cast) -> Action {
         let sets = OF_SETS.iter().filter(|_| cast.sets);
-        let weights = || WEIGHTS.iter().chain(sets.clone());
+        let applications = OF_APPLICATIONS.iter().filter(|_| cast.applications);
+        let weights = || WEIGHTS.iter().chain(sets.clone()).chain(applications.clone());
         let all: u64 = weights().map(|(_, weight)| weight).sum();
         let mut at = dice.between(0, all - 1);
         for (action, weight) in weights() {
@@ -281,6 +295,10 @@ impl World {
             Action::CreateSet | Action::ScaleSet | Action::ChangeSet | Action::DeleteSet => {
                 self.act_on_set(action)
             }
+            Action::CreateApplication
+            | Action::ChangeApplication
+            | Action::DeleteApplication
+            | Action::Violate => self.act_on_application(action),
             Action::Accept
             | Action::Decline
             | Action::Kill
@@ -338,7 +356,7 @@ impl World {
     }
 
     fn apply(&mut self) -> bool {
-        let others = if self.cast.sets { OTHERS } else { 0 };
+        let others = if self.cast.sets || self.cast.applications { OTHERS } else { 0 };
         if self.users.wishes.len() + others >= CROWD {
             return false;
         }

@@ -483,8 +483,11 @@ impl Agent {
             spec.depends_on.iter().map(|one| (one.task.clone(), one.condition)).collect();
         let name = wire.name.clone();
         let process = spec.run.process.as_ref();
-        let crashes = process.is_some_and(|process| process.command == ["crash"]);
-        Kept { program: Program { name, takes, grace_ms, stop_after_ms, crashes, waits_for } }
+        let runs = |what| process.is_some_and(|process| process.command == [what]);
+        let (crashes, tells, standby) = (runs("crash"), runs("look"), spec.standby.is_some());
+        let program =
+            Program { name, takes, grace_ms, stop_after_ms, tells, standby, crashes, waits_for };
+        Kept { program }
     }
 }
 

@@ -20,6 +20,7 @@
 mod action;
 mod agenda;
 mod agent;
+mod applications;
 mod controller;
 mod dice;
 mod drive;

@@ -33,6 +33,8 @@ pub(crate) enum Mutation {
     ForgetfulGate,
     /// A set is told that its rollouts may take everything down.
     HastyRollout,
+    /// A robot that is cut off begins what stands by too soon.
+    HastyStandby,
 }
 
 impl fmt::Display for Mutation {

@@ -9,6 +9,7 @@ use muster_api::phase::TaskPhase;
 
 use crate::agenda::Due;
 use crate::agent::What;
+use crate::applications::Told;
 use crate::dice::Dice;
 use crate::framework::Deed;
 use crate::invariant::Invariant;
@@ -42,6 +43,7 @@ impl World {
         self.house.disk.set_latency(Duration::from_millis(1), Duration::ZERO);
         self.net.slowest = 5;
         self.truth.calm = true;
+        self.truth.told = Told::default();
         self.failed_at = self.now;
         self.agenda.at(self.now + 1, Due::Controller);
         for index in 0..self.agents.len() {
@@ -57,7 +59,8 @@ impl World {
         while self.broken.is_none() {
             let unsettled = self.unsettled();
             if unsettled.is_empty() {
-                return self.ends_were_told();
+                self.ends_were_told();
+                return self.parts_come_home();
             }
             if self.now >= end {
                 let how = format!("not settled: {}", unsettled.join("; "));
@@ -142,6 +145,7 @@ impl World {
         self.unsettled_frameworks(&mut words);
         self.unsettled_drivers(&mut words);
         self.unsettled_sets(&mut words);
+        self.unsettled_applications(&mut words);
         for (key, _, node) in self.view.nodes.all() {
             if !node.status.as_ref().is_some_and(|status| status.is_ready()) {
                 words.push(format!("{key} is not ready"));
@@ -156,7 +160,8 @@ impl World {
                 TaskPhase::Running => !lives,
                 // Between two attempts, or after another task.
                 TaskPhase::Starting => {
-                    lives || !["BackOff", "AwaitingDependency"].contains(&&*status.reason)
+                    lives
+                        || !["BackOff", "AwaitingDependency", "Standby"].contains(&&*status.reason)
                 }
                 TaskPhase::Succeeded | TaskPhase::Failed => lives,
                 TaskPhase::Bound | TaskPhase::Stopping | TaskPhase::Unknown => true,

@@ -8,7 +8,9 @@ use muster_agent_core::observed::Exit;
 use muster_api::id::TaskUid;
 use muster_api::kind::task::depend::DependencyCondition;
 
+use crate::applications::{Told, part_of};
 use crate::invariant::{Invariant, Violation};
+use crate::kernel::Program;
 
 /// What a process takes of its node.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -78,6 +80,12 @@ pub(crate) struct Beside {
 #[derive(Debug, Default)]
 pub(crate) struct Truth {
     rooms: Vec<Room>,
+    /// What those tell that do.
+    pub(crate) told: Told,
+    /// Of the nodes.
+    node_names: Vec<String>,
+    /// Which part each live task is.
+    parts: BTreeMap<TaskUid, String>,
     /// No program ends by itself any more, but those that must.
     pub(crate) calm: bool,
     /// Which nodes have a gate.
@@ -101,8 +109,8 @@ pub(crate) struct Truth {
 
 impl Truth {
     /// By node what it has, and whether it has a gate.
-    pub(crate) fn new(rooms: Vec<Room>, gated: Vec<bool>) -> Truth {
-        Truth { rooms, gated, ..Truth::default() }
+    pub(crate) fn new(rooms: Vec<Room>, node_names: Vec<String>, gated: Vec<bool>) -> Truth {
+        Truth { rooms, node_names, gated, ..Truth::default() }
     }
 
     /// A process begins.
@@ -145,6 +153,33 @@ impl Truth {
             )));
         }
         self.live.insert(uid.clone(), live);
+        Ok(())
+    }
+
+    /// The index of a node.
+    pub(crate) fn node_named(&self, name: &str) -> Option<usize> {
+        self.node_names.iter().position(|node| node == name)
+    }
+
+    /// What a robot begins by itself was away, and has surely ended.
+    ///
+    /// # Errors
+    ///
+    /// When it lives.
+    pub(crate) fn begins_alone(
+        &mut self,
+        uid: &TaskUid,
+        program: &Program,
+    ) -> Result<(), Violation> {
+        let Some(part) = part_of(&program.name) else { return Ok(()) };
+        let mut others = self.parts.iter().filter(|(other, of)| *of == part && *other != uid);
+        let lives =
+            |other: &TaskUid| self.live.contains_key(other) && !self.written_off.contains(other);
+        if let Some((other, _)) = others.find(|(other, _)| program.standby && lives(other)) {
+            let how = format!("{} ({uid}) begins by itself, and {other} lives", program.name);
+            return Err(Invariant::NothingRunsTwice.broken(how));
+        }
+        self.parts.insert(uid.clone(), part.to_owned());
         Ok(())
     }
 
@@ -251,6 +286,7 @@ impl Truth {
     /// No process of the attempt is left.
     pub(crate) fn ends(&mut self, uid: &TaskUid, cause: Cause, exit: Option<Exit>) {
         if let Some(live) = self.live.remove(uid) {
+            self.parts.remove(uid);
             self.over.insert(uid.clone(), Over { attempt: live.attempt, cause, exit });
         }
     }

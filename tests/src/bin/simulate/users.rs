@@ -11,6 +11,7 @@ use muster_api::kind::task::TaskSpec;
 use muster_controller::auth::Identity;
 use serde_json::{Value, json};
 
+use crate::applications::{self, Applications};
 use crate::dice::Dice;
 use crate::invariant::{Invariant, Violation};
 use crate::sets::{self, Sets};
@@ -35,6 +36,7 @@ pub(crate) enum Asked {
     Return,
     EStop,
     Set(sets::Wanted),
+    Application(applications::Wanted),
 }
 
 /// A task whose creation was answered 201.
@@ -54,6 +56,7 @@ pub(crate) struct Users {
     next: u64,
     pub(crate) wishes: BTreeMap<TaskUid, Wish>,
     pub(crate) sets: Sets,
+    pub(crate) applications: Applications,
     /// Tasks that may end by order: somebody asked for it, or fenced their node.
     pub(crate) may_end: BTreeSet<TaskUid>,
     pub(crate) writes: u64,
@@ -186,6 +189,7 @@ impl Users {
                 self.wishes.get_mut(uid).into_iter().for_each(|wish| wish.told_to_go = true);
             }
             Asked::Set(wanted) => self.sets.answered(wanted, body),
+            Asked::Application(wanted) => self.applications.answered(wanted, body),
             Asked::Fence(_) | Asked::Cordon | Asked::Hold(_) | Asked::Return | Asked::EStop => {}
         }
         Some(asked)

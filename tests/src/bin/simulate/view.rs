@@ -4,13 +4,14 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use muster_api::id::TaskUid;
+use muster_api::kind::application::Application;
 use muster_api::kind::framework::Framework;
 use muster_api::kind::lease::{HolderKind, Lease, LeaseHolder};
 use muster_api::kind::node::Node;
 use muster_api::kind::task::Task;
 use muster_api::kind::taskset::TaskSet;
 use muster_api::phase::TaskPhase;
-use muster_controller::objects::{FRAMEWORKS, LEASES, NODES, TASK_SETS, TASKS};
+use muster_controller::objects::{APPLICATIONS, FRAMEWORKS, LEASES, NODES, TASK_SETS, TASKS};
 use muster_controller::store::{Key, Resource, Store, Stored};
 use serde::de::DeserializeOwned;
 
@@ -76,6 +77,7 @@ pub(crate) struct View {
     pub(crate) leases: Kind<Lease>,
     pub(crate) frameworks: Kind<Framework>,
     pub(crate) sets: Kind<TaskSet>,
+    pub(crate) applications: Kind<Application>,
     /// Tasks of frameworks that are there: their names, and the uids of their owners.
     pub(crate) owners: BTreeMap<TaskUid, (String, String)>,
     /// The highest epoch that each lease ever had.
@@ -97,6 +99,7 @@ impl Default for View {
             leases: Kind::new(LEASES),
             frameworks: Kind::new(FRAMEWORKS),
             sets: Kind::new(TASK_SETS),
+            applications: Kind::new(APPLICATIONS),
             owners: BTreeMap::new(),
             epochs: BTreeMap::new(),
             fences: BTreeMap::new(),
@@ -128,6 +131,7 @@ impl View {
         self.leases.follow(store)?;
         self.frameworks.follow(store)?;
         self.sets.follow(store)?;
+        self.applications.follow(store)?;
         let changed = self.tasks.follow(store)?;
         self.lives_follow(changed)?;
         self.one_driver()?;

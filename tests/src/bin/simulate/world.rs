@@ -13,6 +13,7 @@ use muster_controller::store::memory::Disk;
 use crate::action::Tally;
 use crate::agenda::{Agenda, Due};
 use crate::agent::{Agent, Hands, What};
+use crate::applications::Told;
 use crate::controller::{Controller, House, Member, Said, Skew};
 use crate::dice::Dice;
 use crate::framework::{Deed, Framework};
@@ -36,11 +37,12 @@ const GATED: [bool; 4] = [true, true, false, false];
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Cast {
     pub(crate) sets: bool,
+    pub(crate) applications: bool,
 }
 
 impl Cast {
     fn of(seed: u64) -> Cast {
-        Cast { sets: seed.is_multiple_of(3) }
+        Cast { sets: seed.is_multiple_of(3), applications: seed % 3 == 1 }
     }
 }
 
@@ -88,6 +90,7 @@ impl World {
         let members: Vec<Member> = machines.iter().map(member).collect();
         let room = |cpu| Room { cpu, memory: 512 << 20 };
         let rooms: Vec<Room> = machines.iter().map(|(_, _, cpu)| room(*cpu)).collect();
+        let names = members.iter().map(|member| member.name.to_string()).collect();
         let agents = members.iter().zip(&rooms).enumerate();
         let agents = agents
             .map(|(index, (member, room))| Agent::new(index, member.clone(), *room, GATED[index]));
@@ -109,7 +112,7 @@ impl World {
             house: House { disk, skew: Skew::default(), dir: dir.to_owned(), members },
             controller: None,
             up_since: None,
-            truth: Truth::new(rooms, GATED.to_vec()),
+            truth: Truth::new(rooms, names, GATED.to_vec()),
             users: Users::default(),
             view: View::default(),
             log: Log::new(aloud),
@@ -226,6 +229,7 @@ impl World {
                 self.let_read(end);
             }
             Due::Lost(conn) => self.lost(conn),
+            Due::WellAgain => self.truth.told = Told::default(),
             Due::Controller => self.start_controller(),
             Due::Heal(node) => self.heal(node),
         }
@@ -376,6 +380,9 @@ impl World {
             if self.cast.sets {
                 self.users.sets.check(&self.view, &self.truth)?;
             }
+            if self.cast.applications {
+                self.users.applications.check(&self.view, &self.truth)?;
+            }
             self.users.nothing_acknowledged_is_lost(&self.view)?;
         }
         self.nobody_drives_beside()?;
@@ -434,11 +441,11 @@ impl World {
             let asked = self.users.may_end.contains(&uid) || launched.is_some_and(lost);
             let status = self.view.task(&uid).and_then(|task| task.status.as_ref());
             let ordered = status.is_some_and(|s| s.stop.is_some());
-            // A set ends its tasks by deleting them; they may be gone already.
+            // A set, and an application, ends its tasks by deleting them; they may be gone already.
             let known = self.users.wishes.contains_key(&uid) || launched.is_some();
             let deleted = |task: &Task| task.metadata.deletion_timestamp.is_some();
-            let of_set = !known && self.view.task(&uid).is_none_or(deleted);
-            if !asked && !ordered && !of_set {
+            let owned = !known && self.view.task(&uid).is_none_or(deleted);
+            if !asked && !ordered && !owned {
                 let how = format!("{uid} was told to end at {at}, and nobody wanted that");
                 return Err(Invariant::WorkOutlivesItsManagers.broken(how));
             }

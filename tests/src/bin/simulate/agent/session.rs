@@ -32,6 +32,17 @@ pub(super) const PAUSE: (u64, u64) = (50, 5_000);
 /// A connection on which nothing was heard for this long is given up.
 const DEAF_AFTER: u64 = 10_000;
 
+/// With a planted fault: what stands by does not wait for as long as it is told.
+fn begin_soon(assignment: &mut proto::Assignment) {
+    let Ok(mut spec) = serde_json::from_slice::<serde_json::Value>(&assignment.spec) else {
+        return;
+    };
+    if let Some(standby) = spec.get_mut("standby") {
+        standby["after"] = "1s".into();
+        assignment.spec = spec.to_string().into_bytes().into();
+    }
+}
+
 /// One session.
 #[derive(Debug)]
 pub(super) struct Session {
@@ -46,6 +57,8 @@ pub(super) struct Session {
     beats: BTreeMap<u64, Boot>,
     beat: u64,
     last_heard: u64,
+    /// Of the newest heartbeat that was answered, milliseconds.
+    round_trip: Option<u64>,
     /// What it said of the node last, but for where that is.
     node: proto::NodeState,
 }
@@ -96,6 +109,7 @@ impl Agent {
             beats: BTreeMap::new(),
             beat: 0,
             last_heard: hands.now,
+            round_trip: None,
             node,
         });
         hands.net.send_up(conn, Up::Open, hands.now, (hands.dice, hands.agenda));
@@ -246,10 +260,28 @@ impl Agent {
         session.beat += 1;
         session.beats.insert(session.beat, at);
         let (sequence, interval) = (session.beat, session.interval);
-        let heartbeat = proto::Heartbeat { sequence, ..proto::Heartbeat::default() };
+        let link = session
+            .round_trip
+            .map(|millis| proto::Link { round_trip_usec: millis * 1_000, late_permille: 0 });
+        let usage = self.told(hands);
+        let heartbeat = proto::Heartbeat { sequence, usage, link, ..proto::Heartbeat::default() };
         self.say(Say::Heartbeat(heartbeat), hands);
         self.say_reports(hands);
         hands.later(self.index, interval, interval, What::Beat(self.lives, conn));
+    }
+
+    /// What programs tell of topics and signals.
+    fn told(&self, hands: &Hands<'_>) -> Vec<proto::TaskUsage> {
+        let told = hands.truth.told;
+        let live = self.kernel.attempts.iter();
+        let tell = live.filter(|(_, attempt)| attempt.program.tells && attempt.exit.is_none());
+        let say = |name: &str, value| proto::Told { name: name.to_owned(), value };
+        tell.map(|((uid, _), _)| proto::TaskUsage {
+            uid: uid.to_string(),
+            usage: None,
+            told: vec![say("/image", told.hz), say("tilt", told.tilt)],
+        })
+        .collect()
     }
 
     pub(super) fn say_reports(&mut self, hands: &mut Hands<'_>) {
@@ -307,7 +339,11 @@ impl Agent {
             Some(Hear::Heartbeat(answer)) => {
                 let sent = session.beats.remove(&answer.sequence);
                 session.beats.retain(|sequence, _| *sequence > answer.sequence);
-                sent.into_iter().for_each(|sent| self.made_contact(sent));
+                if let Some(sent) = sent {
+                    let now = hands.now.saturating_sub(self.booted_at);
+                    session.round_trip = Some(now.saturating_sub(sent.0));
+                    self.made_contact(sent);
+                }
             }
             Some(Hear::Task(answer)) => {
                 let uid = TaskUid::new(answer.uid);
@@ -320,9 +356,12 @@ impl Agent {
         }
     }
 
-    fn assign(&mut self, message: proto::Assignments, hands: &mut Hands<'_>) {
+    fn assign(&mut self, mut message: proto::Assignments, hands: &mut Hands<'_>) {
         let context = self.context(hands);
         let Some(life) = &mut self.life else { return };
+        if hands.mutation == Some(Mutation::HastyStandby) {
+            message.upserts.iter_mut().for_each(begin_soon);
+        }
         for upsert in &message.upserts {
             if let Some(framework) = &upsert.framework {
                 let uid = TaskUid::new(upsert.uid.as_str());
