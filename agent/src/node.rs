@@ -6,11 +6,9 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use muster_api::condition::{
-    ACTUATORS_FENCED, Condition, DISK_PRESSURE, EMERGENCY_STOP, LOCALIZED, POSE_FRESH,
-    QUOTAS_ENFORCED,
+    ACTUATORS_FENCED, Condition, DISK_PRESSURE, LOCALIZED, POSE_FRESH, QUOTAS_ENFORCED,
 };
 use muster_api::kind::node::RuntimeStatus;
-use muster_api::kind::node::estop::EStopStatus;
 use muster_api::pose::Pose;
 use muster_api::wire::agent::v1 as proto;
 use muster_api::wire::agent_session::NodeReport;
@@ -157,9 +155,8 @@ impl Node {
         if let Some(gate) = &self.shared.gate {
             let standing = gate.standing();
             let standing = standing.borrow();
-            conditions.push(standing.fenced(&self.fixed.actuators));
+            conditions.extend(standing.conditions(&self.fixed.actuators));
             estop = standing.estop();
-            conditions.extend(estop.as_ref().map(emergency_stop));
         }
         let report = NodeReport {
             runtimes,
@@ -213,17 +210,6 @@ fn labels(config: &Config) -> BTreeMap<String, String> {
     labels.extend(machine::labels());
     labels.extend(config.labels.clone());
     labels
-}
-
-fn emergency_stop(estop: &EStopStatus) -> Condition {
-    if estop.tier.is_none() {
-        return Condition::new(EMERGENCY_STOP, false, "Released", String::new());
-    }
-    let demands: Vec<String> =
-        estop.demands.iter().map(|d| format!("{} by {}", d.tier, d.source)).collect();
-    let message =
-        format!("{}; `muster estop NODE --release` lets it move again", demands.join(", "));
-    Condition::new(EMERGENCY_STOP, true, &estop.tier.to_string(), message)
 }
 
 fn conditions(config: &Config, enforced: Result<Enforced, String>) -> Vec<Condition> {

@@ -105,6 +105,8 @@ struct Hall {
     heard: Instant,
     silent: u64,
     gives_back: Option<Grant>,
+    /// Whose grant counts also at a gate that is started again: a person is answered by that.
+    durable: Option<Grant>,
     wake: Option<Boot>,
     record: Record<Waits>,
     /// How often the robot was stopped.
@@ -163,6 +165,7 @@ impl Hall {
             heard: Instant::now(),
             silent: 0,
             gives_back: None,
+            durable: None,
             wake: None,
             record,
             stops: 0,
@@ -427,6 +430,9 @@ impl Hall {
 
     /// How things stand. An agent that does not read is put out: it comes again, and hears everything.
     fn tell_agent(&mut self) {
+        if self.record.is_idle() {
+            self.durable = self.core.holder().cloned();
+        }
         let Some((_, Some(back))) = &self.agent else { return };
         let estop = self.core.estop();
         let demand = |(source, tier): (&Source, Tier)| proto::Demand {
@@ -448,7 +454,7 @@ impl Hall {
         };
         let status = proto::Status {
             wanted: self.wanted,
-            holder: self.core.holder().map(holder),
+            holder: self.durable.as_ref().filter(|g| Some(*g) == self.core.holder()).map(holder),
             newest: Some(lease(self.core.newest())),
             estop: Some(proto::EStop {
                 tier: estop.tier().number(),
@@ -513,6 +519,8 @@ mod tests {
         calls: mpsc::Sender<Input>,
         driver: Lines<BufReader<UnixStream>>,
         answers: mpsc::Receiver<proto::Event>,
+        /// How the gate says that it stands.
+        status: mpsc::Receiver<proto::Status>,
         /// Held: nothing is written.
         disk: Arc<Mutex<()>>,
         _dir: tempfile::TempDir,
@@ -563,10 +571,10 @@ mod tests {
             let (stream, _) = listener.accept().await.unwrap();
             let (back, answers) = mpsc::channel(8);
             let driver = BufReader::new(stream).lines();
-            let mut scene = Scene { urgent, calls, driver, answers, disk, _dir: dir };
+            let (agent, status) = mpsc::channel(64);
+            let mut scene = Scene { urgent, calls, driver, answers, status, disk, _dir: dir };
             // Before all that follows the hall hears that its driver is there: it stops it, and drops what waits for it.
             scene.hears("stop").await;
-            let (agent, _status) = mpsc::channel(64);
             let (admit, admitted): (_, Receiver<()>) = oneshot::channel();
             scene.urgent.send(Input::AgentCame(1, agent)).await.unwrap();
             scene.urgent.send(wanted(6)).await.unwrap();
@@ -637,6 +645,31 @@ mod tests {
             scene.hears("stop").await;
             drop(held);
         }
+    }
+
+    #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+    async fn a_person_is_said_to_hold_the_robot_when_a_gate_that_is_started_again_knows_it() {
+        let mut scene = Scene::start(PATIENT).await;
+        let disk = Arc::clone(&scene.disk);
+        let held = disk.lock().await;
+        let person = Some(proto::Holder { task: "person".to_owned(), epoch: 7 });
+        let wanted = proto::Wanted { id: 7, grant: person.clone(), fence: 7, ..Default::default() };
+        scene.urgent.send(Input::Wanted(1, wanted)).await.unwrap();
+        // The robot first.
+        scene.hears("stop").await;
+        // What is asked afterwards is answered afterwards.
+        scene.urgent.send(Input::Hook("button".to_owned(), Tier::Settle)).await.unwrap();
+        let stopped = |status: &proto::Status| status.estop.as_ref().is_some_and(|e| e.tier == 1);
+        loop {
+            let status = scene.status.recv().await.unwrap();
+            assert_ne!(status.holder, person, "nothing is written yet");
+            if stopped(&status) {
+                break;
+            }
+        }
+        drop(held);
+        while scene.status.recv().await.unwrap().holder != person {}
+        drop((scene.urgent, scene.calls));
     }
 
     #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

@@ -17,7 +17,8 @@
 //! | `hook` | gate | files and pins that stop the robot |
 //! | `record` | gate | what must be durable, and what waits for that |
 //! | `log` | gate | its log, bounded |
-//! | `keeper` | agent | keeps a gate alive, tells it what the controller grants, and hears how it stands |
+//! | `keeper` | agent | keeps a gate alive, tells it what is wanted, and hears how it stands |
+//! | `wanted`, `standing` | agent | what it is told, what it says; pure |
 //!
 //! It is a hidden verb of the agent's binary, `… gate DIR`: one event loop, one thread. In DIR:
 //!
@@ -38,6 +39,8 @@ pub(crate) mod keeper;
 mod log;
 mod record;
 pub(crate) mod settings;
+mod standing;
+mod wanted;
 
 use std::ffi::OsString;
 use std::io::Write as _;
@@ -46,6 +49,8 @@ use std::path::PathBuf;
 use crate::companion;
 use crate::durable::{self, FileError};
 use settings::Settings;
+pub use standing::Standing;
+pub use wanted::Wanted;
 
 /// The verb that both binaries know.
 pub const VERB: &str = "gate";

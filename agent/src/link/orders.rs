@@ -49,8 +49,7 @@ impl Orders {
         let begun = begun.await.map_err(|_| StreamError::Deaf)?.map_err(Box::new)?;
         let mut orders = begun.into_inner();
         while let Some(order) = orders.message().await.map_err(Box::new)? {
-            self.gate.demand(order.estop_tier, order.estop_release);
-            self.gate.person(order.lease_fence, order.lease_held);
+            self.gate.order(&order);
             self.heard.send_replace(true);
         }
         Err(StreamError::Closed)

@@ -36,7 +36,7 @@ use crate::clock;
 use crate::driver::{Shared, chain};
 use crate::executor::direct::Door;
 use crate::executor::frame::FRAME_MAX;
-use crate::gate::keeper::Standing;
+use crate::gate::Standing;
 use crate::node::Node;
 use crate::told;
 

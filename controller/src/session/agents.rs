@@ -86,6 +86,30 @@ impl Agents {
         self.tasks.spawn(session.run());
         ReceiverStream::new(told)
     }
+
+    /// What people decide about `node`, whole: how it is, and each change. `key`: of its agent's certificate.
+    ///
+    /// # Errors
+    ///
+    /// Whoever shows another certificate than its agent's hears nothing.
+    pub fn orders_for(
+        &self,
+        node: &NodeName,
+        key: &str,
+    ) -> Result<impl Stream<Item = wire::NodeOrder> + Send + use<>, Status> {
+        // Followed before it is read: what changes in between is told.
+        let told = self.sessions.orders().follow(node);
+        let (stored, object) =
+            nodes::admit(&self.context, node, key).map_err(|error| status(&error))?;
+        let lease = self.context.store.get(&objects::lease_key(node.as_str(), DEFAULT_GROUP));
+        if let Some((lease, stored)) = lease.and_then(|s| Some((objects::read::<Lease>(&s)?, s))) {
+            self.sessions.orders().tell_lease(&lease, stored.revision);
+        }
+        self.sessions.orders().say(node, stored.revision, node_order(&object.spec));
+        let told = WatchStream::new(told).filter(|told| future::ready(told.revision > 0));
+        let stop = self.context.stop.clone().cancelled_owned();
+        Ok(told.map(|told| told.order).take_until(stop))
+    }
 }
 
 /// What an agent says, in order. Dropping a wait for the next message loses none.
@@ -117,19 +141,7 @@ impl AgentService for Agents {
         request: Request<wire::OrdersRequest>,
     ) -> Result<Response<Self::OrdersStream>, Status> {
         let (node, key) = agent_of(&request)?;
-        // Followed before it is read: what changes in between is told.
-        let told = self.sessions.orders().follow(&node);
-        let (stored, object) =
-            nodes::admit(&self.context, &node, &key).map_err(|error| status(&error))?;
-        let lease = self.context.store.get(&objects::lease_key(node.as_str(), DEFAULT_GROUP));
-        if let Some((lease, stored)) = lease.and_then(|s| Some((objects::read::<Lease>(&s)?, s))) {
-            self.sessions.orders().tell_lease(&lease, stored.revision);
-        }
-        self.sessions.orders().say(&node, stored.revision, node_order(&object.spec));
-        let told = WatchStream::new(told).filter(|told| future::ready(told.revision > 0));
-        let told = told.map(|told| Ok(told.order));
-        let stop = self.context.stop.clone().cancelled_owned();
-        Ok(Response::new(Box::pin(told.take_until(stop))))
+        Ok(Response::new(Box::pin(self.orders_for(&node, &key)?.map(Ok))))
     }
 
     async fn messages(

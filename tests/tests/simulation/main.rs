@@ -28,8 +28,12 @@ fn a_seed_is_a_run() {
 
 /// Plants a fault, and looks that it breaks one of these invariants, in one of some runs.
 fn is_found(mutation: &str, invariants: &[&str]) {
+    is_found_within("2400", mutation, invariants);
+}
+
+fn is_found_within(steps: &str, mutation: &str, invariants: &[&str]) {
     let args =
-        ["--seed", "1", "--steps", "2400", "--run", "300", "--no-shrink", "--mutate", mutation];
+        ["--seed", "1", "--steps", steps, "--run", "300", "--no-shrink", "--mutate", mutation];
     let (well, said) = simulate(&args);
     assert!(!well, "{mutation} is not found: {said}");
     let broken = said.lines().find_map(|line| line.split_once(" is broken by seed "));
@@ -88,6 +92,17 @@ fn an_end_that_no_framework_heard_of_is_found() {
 #[test]
 fn an_offer_that_does_not_come_is_found() {
     is_found("lost-offer", &["everything_ends_or_explains_itself"]);
+}
+
+#[test]
+fn a_person_who_was_told_too_soon_that_a_robot_is_theirs_is_found() {
+    // The grant that the person has does not count at the gate, which shows at the latest when all is quiet.
+    is_found("forged-hold", &["one_driver", "everything_ends_or_explains_itself"]);
+}
+
+#[test]
+fn a_rollout_that_takes_too_much_down_is_found() {
+    is_found_within("12000", "hasty-rollout", &["work_outlives_its_managers"]);
 }
 
 #[test]

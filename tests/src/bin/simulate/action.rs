@@ -6,7 +6,7 @@ use crate::agenda::Due;
 use crate::agent::What;
 use crate::dice::Dice;
 use crate::framework::Deed;
-use crate::world::World;
+use crate::world::{Cast, World};
 
 /// What a step does.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -43,6 +43,25 @@ pub(crate) enum Action {
     Fence,
     Cordon,
     Uncordon,
+    /// A person wants a robot's actuators, whoever has them or if they are free; gives them back.
+    Take,
+    Acquire,
+    Return,
+    /// A person stops a robot, and releases it; somebody presses its button; its gate is killed.
+    EStop,
+    Release,
+    Button,
+    KillGate,
+    /// Somebody wants a set, another number of its tasks, others in their place, or it gone.
+    CreateSet,
+    ScaleSet,
+    ChangeSet,
+    DeleteSet,
+    /// Somebody wants an application, another policy of it, or it gone; what its part tells is not as it should be.
+    CreateApplication,
+    ChangeApplication,
+    DeleteApplication,
+    Violate,
     /// A framework launches, declines, ends a task, asks for the state of all.
     Accept,
     Decline,
@@ -56,7 +75,7 @@ pub(crate) enum Action {
 }
 
 /// How often each is drawn.
-const WEIGHTS: [(Action, u64); 30] = [
+const WEIGHTS: [(Action, u64); 37] = [
     (Action::Apply, 60),
     (Action::Delete, 40),
     (Action::Pass, 60),
@@ -79,6 +98,13 @@ const WEIGHTS: [(Action, u64); 30] = [
     (Action::Fence, 8),
     (Action::Cordon, 4),
     (Action::Uncordon, 8),
+    (Action::Take, 8),
+    (Action::Acquire, 4),
+    (Action::Return, 10),
+    (Action::EStop, 3),
+    (Action::Release, 6),
+    (Action::Button, 2),
+    (Action::KillGate, 4),
     (Action::Accept, 40),
     (Action::Decline, 8),
     (Action::Kill, 10),
@@ -87,6 +113,22 @@ const WEIGHTS: [(Action, u64); 30] = [
     (Action::CutFramework, 6),
     (Action::CrashFramework, 5),
     (Action::TearDown, 2),
+];
+
+/// The same of sets, in runs that have some.
+const OF_SETS: [(Action, u64); 4] = [
+    (Action::CreateSet, 12),
+    (Action::ScaleSet, 8),
+    (Action::ChangeSet, 16),
+    (Action::DeleteSet, 3),
+];
+
+/// The same of applications.
+const OF_APPLICATIONS: [(Action, u64); 4] = [
+    (Action::CreateApplication, 30),
+    (Action::ChangeApplication, 6),
+    (Action::DeleteApplication, 2),
+    (Action::Violate, 16),
 ];
 
 /// What was done.
@@ -98,14 +140,19 @@ pub(crate) struct Tally {
 
 /// Tasks that are there at once; more only make every step slower.
 const CROWD: usize = 14;
+/// What is left to others of that.
+const OTHERS: usize = 5;
 
 impl Action {
-    pub(crate) fn drawn(dice: &mut Dice) -> Action {
-        let all: u64 = WEIGHTS.iter().map(|(_, weight)| weight).sum();
+    pub(crate) fn drawn(dice: &mut Dice, cast: Cast) -> Action {
+        let sets = OF_SETS.iter().filter(|_| cast.sets);
+        let applications = OF_APPLICATIONS.iter().filter(|_| cast.applications);
+        let weights = || WEIGHTS.iter().chain(sets.clone()).chain(applications.clone());
+        let all: u64 = weights().map(|(_, weight)| weight).sum();
         let mut at = dice.between(0, all - 1);
-        for (action, weight) in WEIGHTS {
-            if at < weight {
-                return action;
+        for (action, weight) in weights() {
+            if at < *weight {
+                return *action;
             }
             at -= weight;
         }
@@ -118,7 +165,7 @@ impl World {
     pub(crate) fn step(&mut self, step: u64) {
         self.dice = Dice::of(self.seed, step + 1);
         self.log.step = step;
-        let action = Action::drawn(&mut self.dice);
+        let action = Action::drawn(&mut self.dice, self.cast);
         let done = self.act(action);
         if done {
             self.tally.done += 1;
@@ -133,6 +180,7 @@ impl World {
             _ => self.dice.between(1_000, 8_000),
         };
         self.run_to(self.now + wait);
+        self.drive();
         self.check();
     }
 
@@ -169,7 +217,13 @@ impl World {
             }
             Action::CrashAgent => {
                 let up = self.agents[index].is_up();
-                self.with_agent(index, |agent, hands| agent.crash(hands));
+                let orderly = self.dice.one_in(3);
+                self.with_agent(index, |agent, hands| {
+                    if orderly {
+                        agent.leave(hands);
+                    }
+                    agent.crash(hands);
+                });
                 let wait = self.dice.between(1, 6_000);
                 self.agenda.at(self.now + wait, Due::Machine(index, What::Begin));
                 up
@@ -226,9 +280,25 @@ impl World {
             }
             Action::Fence => {
                 let name = self.agents[index].name().to_owned();
-                self.may_end_on(index);
-                self.ask(|users, _| Some(users.fence(&name)))
+                let tasks = self.may_end_on(index);
+                self.truth.written_off.extend(tasks.iter().cloned());
+                self.ask(|users, _| Some(users.fence(&name, tasks)))
             }
+            Action::Take | Action::Acquire | Action::Return => self.hold(action, index),
+            Action::EStop | Action::Release => self.stop_robot(action, index),
+            Action::Button => {
+                let wait = self.dice.between(0, 3_000);
+                self.agenda.at(self.now + wait, Due::Machine(index, What::LetGo));
+                self.with_agent(index, |agent, hands| agent.button(true, hands))
+            }
+            Action::KillGate => self.with_agent(index, |agent, hands| agent.kill_gate(hands)),
+            Action::CreateSet | Action::ScaleSet | Action::ChangeSet | Action::DeleteSet => {
+                self.act_on_set(action)
+            }
+            Action::CreateApplication
+            | Action::ChangeApplication
+            | Action::DeleteApplication
+            | Action::Violate => self.act_on_application(action),
             Action::Accept
             | Action::Decline
             | Action::Kill
@@ -286,7 +356,8 @@ impl World {
     }
 
     fn apply(&mut self) -> bool {
-        if self.users.wishes.len() >= CROWD {
+        let others = if self.cast.sets || self.cast.applications { OTHERS } else { 0 };
+        if self.users.wishes.len() + others >= CROWD {
             return false;
         }
         let name = format!("t{}", self.log.step);

@@ -21,6 +21,8 @@ pub(crate) enum Due {
     Lost(Conn),
     /// The controller is started again.
     Controller,
+    /// What parts tell is as it should be again.
+    WellAgain,
     /// A partition ends.
     Heal(usize),
 }

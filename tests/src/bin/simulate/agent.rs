@@ -4,6 +4,7 @@
 //! it, answers in any time.
 
 mod carry;
+mod gate;
 mod session;
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
@@ -17,6 +18,8 @@ use muster_agent_core::workload::Workload;
 use muster_api::id::TaskUid;
 use muster_api::kind::node::NodeKind;
 use muster_api::kind::task::TaskSpec;
+use muster_api::wire::agent::v1 as proto;
+use muster_api::wire::gate::v1 as gate_proto;
 
 use crate::agenda::{Agenda, Due};
 use crate::controller::{EPOCH, Member};
@@ -27,6 +30,7 @@ use crate::log::Log;
 use crate::mutation::Mutation;
 use crate::net::{Conn, Net};
 use crate::truth::{Room, Takes, Truth};
+use gate::{Gateway, Hold};
 use session::Session;
 
 /// What a machine may use of the world.
@@ -73,11 +77,46 @@ pub(crate) enum What {
     /// A runtime answers.
     Answer(u32, TaskUid, Box<Event>),
     /// A shim starts its program.
-    Start { boot: u64, life: u32, uid: TaskUid, attempt: u32, claim: u64, unclear: bool },
+    Start {
+        boot: u64,
+        life: u32,
+        uid: TaskUid,
+        attempt: u32,
+        claim: u64,
+        unclear: bool,
+    },
     /// A process ends.
-    Ends { boot: u64, uid: TaskUid, attempt: u32, end: End },
+    Ends {
+        boot: u64,
+        uid: TaskUid,
+        attempt: u32,
+        end: End,
+    },
     /// A shim looks when contact was last.
-    Guard { boot: u64, uid: TaskUid, attempt: u32 },
+    Guard {
+        boot: u64,
+        uid: TaskUid,
+        attempt: u32,
+    },
+    /// What may drive waits until its gate counts what was wanted by then, or for too long.
+    Cleared {
+        life: u32,
+        uid: TaskUid,
+        attempt: u32,
+        wanted: u64,
+        until: u64,
+    },
+    /// The agent comes to its gate. It dials for orders, and looks whether they are heard still.
+    Attach(u32),
+    DialOrders(u32),
+    OrdersLook(u32, Conn),
+    /// Between one gate and one life of its agent.
+    ToGate(u32, u32, Box<gate_proto::Wanted>),
+    FromGate(u32, u32, Box<gate_proto::Status>),
+    /// A gate's record is on the disk.
+    GateWritten(u32),
+    /// The button on the robot is let go.
+    LetGo,
 }
 
 /// What is kept of a task beside the core's state.
@@ -118,6 +157,7 @@ struct Life {
     tasks: BTreeMap<TaskUid, Cell>,
     watches: BTreeSet<(TaskUid, u32)>,
     session: Option<Session>,
+    hold: Hold,
     pause: u64,
 }
 
@@ -131,6 +171,8 @@ pub(crate) struct Agent {
     pub(crate) actuators: Vec<String>,
     pub(crate) place: Option<(f64, f64)>,
     pub(crate) kernel: Kernel,
+    /// None: nothing stands before its drivers.
+    pub(crate) gate: Option<Gateway>,
     disk: BTreeMap<TaskUid, Record>,
     /// How far its date is off, milliseconds.
     pub(crate) skew: i64,
@@ -145,7 +187,7 @@ pub(crate) struct Agent {
 }
 
 impl Agent {
-    pub(crate) fn new(index: usize, member: Member, room: Room) -> Agent {
+    pub(crate) fn new(index: usize, member: Member, room: Room, gated: bool) -> Agent {
         let robot = member.kind == NodeKind::Robot;
         let some = |word: &str| if robot { vec![word.to_owned()] } else { Vec::new() };
         Agent {
@@ -156,6 +198,7 @@ impl Agent {
             actuators: some("base:Drive"),
             place: robot.then_some((index as f64 * 10.0, 0.0)),
             kernel: Kernel::default(),
+            gate: gated.then(Gateway::default),
             disk: BTreeMap::new(),
             skew: 0,
             full_until: 0,
@@ -218,6 +261,8 @@ impl Agent {
         if let Some(session) = life.session {
             session.end(hands);
         }
+        life.hold.end(hands);
+        self.leave_gate(hands);
     }
 
     fn keep(&mut self, uid: TaskUid, record: Record, hands: &Hands<'_>) {
@@ -229,6 +274,7 @@ impl Agent {
     /// The power fails; the machine is there again in a moment, and its agent with it.
     pub(crate) fn reboot(&mut self, hands: &mut Hands<'_>) {
         self.crash(hands);
+        self.kill_gate(hands);
         self.kernel.reboot(hands.truth);
         self.boot += 1;
         let down = hands.dice.between(500, 8_000);
@@ -256,7 +302,15 @@ impl Agent {
                     self.guard(&uid, attempt, hands);
                 }
             }
-            What::Dial(life)
+            What::GateWritten(gate) => self.gate_written(gate, hands),
+            What::ToGate(gate, life, wanted) => self.reaches_gate((gate, life), &wanted, hands),
+            What::LetGo => drop(self.button(false, hands)),
+            What::Cleared { life, .. }
+            | What::Attach(life)
+            | What::DialOrders(life)
+            | What::OrdersLook(life, _)
+            | What::FromGate(life, ..)
+            | What::Dial(life)
             | What::Beat(life, _)
             | What::NoWelcome(life, _)
             | What::Written(life, _)
@@ -264,6 +318,13 @@ impl Agent {
             | What::Perform(life, ..)
             | What::Answer(life, ..)
                 if life != self.lives || self.life.is_none() => {}
+            What::Cleared { uid, attempt, wanted, until, .. } => {
+                self.launch(&uid, attempt, (wanted, until), hands);
+            }
+            What::Attach(_) => self.attach(hands),
+            What::DialOrders(_) => self.dial_orders(hands),
+            What::OrdersLook(_, conn) => self.look_at_orders(conn, hands),
+            What::FromGate(_, gate, status) => self.hear_gate(gate, *status, hands),
             What::Dial(_) => self.dial(hands),
             What::Beat(_, conn) => self.beat(conn, hands),
             What::NoWelcome(_, conn) => self.no_welcome(conn, hands),
@@ -298,10 +359,14 @@ impl Agent {
         );
         let uids: Vec<TaskUid> = life.tasks.keys().cloned().collect();
         self.life = Some(life);
+        for uid in &uids {
+            self.seat(uid, hands);
+        }
         for uid in uids {
             self.pump(&uid, hands);
         }
         self.look_at_others(hands);
+        self.hold_gate(hands);
         hands.later(self.index, 1, 20, What::Dial(self.lives));
     }
 
@@ -322,6 +387,7 @@ impl Agent {
         let Some(Kept { program }) = self.kept_of(uid).cloned() else { return };
         let (since, started) = (self.clock(hands.now).0, self.wall(hands));
         let (stop_after, name) = (program.stop_after_ms, program.name.clone());
+        let crashes = program.crashes;
         let begun = self.kernel.begin(
             (uid, attempt, claim),
             (self.index, since, started),
@@ -340,7 +406,11 @@ impl Agent {
             let (boot, uid) = (self.boot, uid.clone());
             hands.later(self.index, limit, limit, What::Guard { boot, uid, attempt });
         }
-        if hands.dice.one_in(3) {
+        if crashes {
+            let (boot, uid) = (self.boot, uid.clone());
+            let ends = What::Ends { boot, uid, attempt, end: End::Exited(1) };
+            hands.later(self.index, 20, 1_500, ends);
+        } else if !hands.truth.calm && hands.dice.one_in(3) {
             let end = End::Exited(i32::try_from(hands.dice.between(0, 2)).unwrap_or(1));
             let (boot, uid) = (self.boot, uid.clone());
             hands.later(self.index, 50, 30_000, What::Ends { boot, uid, attempt, end });
@@ -365,6 +435,7 @@ impl Agent {
             hands.now,
             format_args!("{} ended {uid} attempt {attempt}: {:?}", self.name(), exit.end),
         );
+        self.lets_go(uid, hands);
         let id = (uid.clone(), attempt);
         if self.life.as_mut().is_some_and(|life| life.watches.remove(&id)) {
             self.say_exit(uid, attempt, exit, hands);
@@ -397,11 +468,11 @@ impl Agent {
         hands.later(self.index, 1, grace.max(1), What::Ends { boot, uid, attempt, end });
     }
 
-    fn kept(wire_name: &str, spec: &TaskSpec) -> Kept {
+    fn kept(wire: &proto::Assignment, spec: &TaskSpec) -> Kept {
         let reserved = spec.resources.reserved();
         let stop_after = spec.stop_after_disconnect();
         let takes = Takes {
-            drives: !spec.resources.actuators.is_empty(),
+            drives: wire.lease.as_ref().map(|lease| lease.epoch),
             cpu: reserved.cpu.0,
             memory: reserved.memory.0,
         };
@@ -410,8 +481,13 @@ impl Agent {
         let grace_ms = u64::from(spec.grace_period_seconds) * 1_000;
         let waits_for =
             spec.depends_on.iter().map(|one| (one.task.clone(), one.condition)).collect();
-        let name = wire_name.to_owned();
-        Kept { program: Program { name, takes, grace_ms, stop_after_ms, waits_for } }
+        let name = wire.name.clone();
+        let process = spec.run.process.as_ref();
+        let runs = |what| process.is_some_and(|process| process.command == [what]);
+        let (crashes, tells, standby) = (runs("crash"), runs("look"), spec.standby.is_some());
+        let program =
+            Program { name, takes, grace_ms, stop_after_ms, tells, standby, crashes, waits_for };
+        Kept { program }
     }
 }
 

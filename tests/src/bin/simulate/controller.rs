@@ -6,6 +6,7 @@
 use std::collections::BTreeMap;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
+use std::pin::pin;
 use std::sync::atomic::{AtomicI64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
@@ -37,6 +38,7 @@ use muster_controller::store::memory::Disk;
 use muster_controller::store::{Key, Op, Precondition, Store, Stored};
 use tokio::runtime::{Builder, Runtime};
 use tokio::sync::{Notify, mpsc, watch};
+use tokio::task::AbortHandle;
 use tokio::time::Instant;
 use tokio_stream::StreamExt as _;
 use tokio_stream::wrappers::UnboundedReceiverStream;
@@ -89,6 +91,8 @@ pub(crate) enum Said {
     ToAgent(Conn, Box<wire::ControllerMessage>),
     /// To a framework.
     ToFramework(Conn, Box<framework::Event>),
+    /// To an agent: what people order.
+    Order(Conn, wire::NodeOrder),
     /// It has closed a session.
     Closed(Conn),
     /// The answer to a client's request: code and body.
@@ -128,6 +132,7 @@ pub(crate) struct Controller {
     port: Option<Port>,
     inbound: BTreeMap<Conn, mpsc::UnboundedSender<Result<wire::AgentMessage, Status>>>,
     guests: BTreeMap<Conn, Guest>,
+    orders: BTreeMap<Conn, AbortHandle>,
 }
 
 /// A framework's connection.
@@ -167,6 +172,7 @@ impl Controller {
             port: None,
             inbound: BTreeMap::new(),
             guests: BTreeMap::new(),
+            orders: BTreeMap::new(),
         }
     }
 
@@ -226,6 +232,24 @@ impl Controller {
     pub(crate) fn hang_up(&mut self, conn: Conn) {
         self.inbound.remove(&conn);
         self.guests.remove(&conn);
+        self.orders.remove(&conn).inspect(AbortHandle::abort);
+    }
+
+    /// An agent wants to hear what people order. False: nobody listens, or not to this one.
+    pub(crate) fn order(&mut self, conn: Conn, node: &NodeName, key: &str) -> bool {
+        let Some(port) = &self.port else { return false };
+        let _entered = self.runtime.enter();
+        let Ok(orders) = port.agents.orders_for(node, key) else { return false };
+        let outbox = Arc::clone(&self.outbox);
+        let told = self.runtime.spawn(async move {
+            let mut orders = pin!(orders);
+            while let Some(order) = orders.next().await {
+                outbox.say(Said::Order(conn, order));
+            }
+            outbox.say(Said::Closed(conn));
+        });
+        self.orders.insert(conn, told.abort_handle());
+        true
     }
 
     /// A framework has connected. False: nobody listens.
@@ -262,11 +286,13 @@ impl Controller {
         }
     }
 
-    /// A request of an administrator. False: nobody listens.
+    /// A request of an administrator, or of whom it names. False: nobody listens.
     pub(crate) fn request(&self, id: u64, mut request: Request<Body>) -> bool {
         let Some(port) = &self.port else { return false };
-        let admin = Identity::Admin { name: "simulation".to_owned() };
-        request.extensions_mut().insert(admin);
+        if request.extensions().get::<Identity>().is_none() {
+            let admin = Identity::Admin { name: "simulation".to_owned() };
+            request.extensions_mut().insert(admin);
+        }
         let (router, outbox) = (port.router.clone(), Arc::clone(&self.outbox));
         drop(self.runtime.spawn(async move {
             let Ok(response) = router.oneshot(request).await;

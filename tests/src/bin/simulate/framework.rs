@@ -351,7 +351,7 @@ impl Framework {
         let event = match what {
             Down::End => return self.lose(hands),
             Down::Event(event) => event.event,
-            Down::Message(_) => return,
+            Down::Message(_) | Down::Order(_) => return,
         };
         let subscribed = session.subscribed;
         if subscribed {
@@ -385,6 +385,8 @@ impl Framework {
                     self.tenures.entry(id).or_default().over = true;
                     // Another one begins in its place.
                     self.lives += 1;
+                    // Its end may never come.
+                    self.later(LOOK_EVERY, Deed::Look(self.lives, conn), hands);
                 }
             }
             _ => {}

@@ -20,6 +20,12 @@ pub(crate) struct Program {
     pub(crate) grace_ms: u64,
     /// It may run so long without contact, milliseconds.
     pub(crate) stop_after_ms: Option<u64>,
+    /// It tells of a topic and of a signal.
+    pub(crate) tells: bool,
+    /// Its node may begin it by itself, without contact.
+    pub(crate) standby: bool,
+    /// It ends by itself, soon and badly.
+    pub(crate) crashes: bool,
     /// Tasks that must have come so far before it begins.
     pub(crate) waits_for: Vec<(String, DependencyCondition)>,
 }
@@ -70,6 +76,7 @@ impl Kernel {
         }
         truth.may_begin(&program.name, &program.waits_for)?;
         truth.names.insert(program.name.clone(), uid.clone());
+        truth.begins_alone(uid, &program)?;
         truth.begins(uid, Live { node, attempt, takes: program.takes })?;
         let begun =
             Attempt { program, started, since, exit: None, ordered: false, disconnected: false };

@@ -20,8 +20,10 @@
 mod action;
 mod agenda;
 mod agent;
+mod applications;
 mod controller;
 mod dice;
+mod drive;
 mod fleet;
 mod framework;
 mod invariant;
@@ -30,6 +32,7 @@ mod log;
 mod mutation;
 mod net;
 mod run;
+mod sets;
 mod settle;
 mod shrink;
 mod truth;

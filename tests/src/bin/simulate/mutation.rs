@@ -27,6 +27,14 @@ pub(crate) enum Mutation {
     LostOffer,
     /// What runs cannot be ended by order.
     DeafToStops,
+    /// An agent says that a person's grant counts, and its gate has not heard of it.
+    ForgedHold,
+    /// A gate that is started again has forgotten what it kept.
+    ForgetfulGate,
+    /// A set is told that its rollouts may take everything down.
+    HastyRollout,
+    /// A robot that is cut off begins what stands by too soon.
+    HastyStandby,
 }
 
 impl fmt::Display for Mutation {

@@ -19,6 +19,8 @@ pub(crate) type Conn = u64;
 #[derive(Debug, Clone)]
 pub(crate) enum Up {
     Open,
+    /// An agent wants to hear what people order.
+    Orders,
     Message(Box<wire::AgentMessage>),
     Call(Box<framework::Call>),
     End,
@@ -29,6 +31,7 @@ pub(crate) enum Up {
 pub(crate) enum Down {
     Message(Box<wire::ControllerMessage>),
     Event(Box<framework::Event>),
+    Order(wire::NodeOrder),
     End,
 }
 

@@ -3,11 +3,13 @@
 use std::time::Duration;
 
 use muster_api::kind::framework::ACKNOWLEDGE_FINALIZER;
+use muster_api::kind::node::NodeStatus;
 use muster_api::kind::task::Task;
 use muster_api::phase::TaskPhase;
 
 use crate::agenda::Due;
 use crate::agent::What;
+use crate::applications::Told;
 use crate::dice::Dice;
 use crate::framework::Deed;
 use crate::invariant::Invariant;
@@ -26,6 +28,11 @@ fn waits_to_be_heard(task: &Task) -> bool {
     phase(task).is_terminal() && finalizers.any(|finalizer| finalizer == ACKNOWLEDGE_FINALIZER)
 }
 
+/// Nothing new is given to a robot that is stopped.
+fn is_stopped(status: &NodeStatus) -> bool {
+    status.estop.as_ref().is_some_and(|estop| !estop.tier.is_none())
+}
+
 impl World {
     /// No fault from now on; gives the world until everything has settled, and says what has not.
     pub(crate) fn settle(&mut self) {
@@ -35,6 +42,8 @@ impl World {
         self.house.disk.failures().mislead_next(0);
         self.house.disk.set_latency(Duration::from_millis(1), Duration::ZERO);
         self.net.slowest = 5;
+        self.truth.calm = true;
+        self.truth.told = Told::default();
         self.failed_at = self.now;
         self.agenda.at(self.now + 1, Due::Controller);
         for index in 0..self.agents.len() {
@@ -50,13 +59,15 @@ impl World {
         while self.broken.is_none() {
             let unsettled = self.unsettled();
             if unsettled.is_empty() {
-                return self.ends_were_told();
+                self.ends_were_told();
+                return self.parts_come_home();
             }
             if self.now >= end {
                 let how = format!("not settled: {}", unsettled.join("; "));
                 return self.break_with(Invariant::EverythingEndsOrExplainsItself.broken(how));
             }
             self.run_to(self.now + LOOK_EVERY);
+            self.drive();
             self.check();
         }
     }
@@ -91,7 +102,8 @@ impl World {
                 words.push(format!("{name} waits for an answer to an Accept"));
             }
             for (key, _, node) in self.view.nodes.all() {
-                let open = !node.spec.unschedulable && node.spec.taints.is_empty();
+                let stopped = node.status.as_ref().is_some_and(is_stopped);
+                let open = !node.spec.unschedulable && node.spec.taints.is_empty() && !stopped;
                 // An offer of nothing is none.
                 let gives = node.status.as_ref().is_some_and(|status| {
                     let left = status.free.cpu.0 > 0 && status.free.memory.0 > 0;
@@ -112,7 +124,7 @@ impl World {
     }
 
     /// What is still under way.
-    fn unsettled(&self) -> Vec<String> {
+    fn unsettled(&mut self) -> Vec<String> {
         let mut words = Vec::new();
         if self.up_since.is_none() {
             words.push("the controller does not answer".to_owned());
@@ -131,6 +143,9 @@ impl World {
             }
         }
         self.unsettled_frameworks(&mut words);
+        self.unsettled_drivers(&mut words);
+        self.unsettled_sets(&mut words);
+        self.unsettled_applications(&mut words);
         for (key, _, node) in self.view.nodes.all() {
             if !node.status.as_ref().is_some_and(|status| status.is_ready()) {
                 words.push(format!("{key} is not ready"));
@@ -145,7 +160,8 @@ impl World {
                 TaskPhase::Running => !lives,
                 // Between two attempts, or after another task.
                 TaskPhase::Starting => {
-                    lives || !["BackOff", "AwaitingDependency"].contains(&&*status.reason)
+                    lives
+                        || !["BackOff", "AwaitingDependency", "Standby"].contains(&&*status.reason)
                 }
                 TaskPhase::Succeeded | TaskPhase::Failed => lives,
                 TaskPhase::Bound | TaskPhase::Stopping | TaskPhase::Unknown => true,

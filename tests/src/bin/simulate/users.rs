@@ -6,23 +6,37 @@ use axum::body::Body;
 use bytes::Bytes;
 use http::Request;
 use muster_api::id::TaskUid;
+use muster_api::kind::node::estop::EStopTier;
 use muster_api::kind::task::TaskSpec;
+use muster_controller::auth::Identity;
 use serde_json::{Value, json};
 
+use crate::applications::{self, Applications};
 use crate::dice::Dice;
 use crate::invariant::{Invariant, Violation};
+use crate::sets::{self, Sets};
 use crate::view::View;
 
 const TASKS: &str = "/apis/muster.dev/v1alpha1/namespaces/default/tasks";
 const NODES: &str = "/apis/muster.dev/v1alpha1/nodes";
+const LEASES: &str = "/apis/muster.dev/v1alpha1/leases";
+/// Who holds robots.
+const PEOPLE: [&str; 2] = ["ada", "bob"];
 
 /// What somebody asked and was not answered yet.
 #[derive(Debug, Clone)]
 pub(crate) enum Asked {
     Create(String),
     Delete(TaskUid),
-    Fence,
+    /// With the tasks that are there.
+    Fence(Vec<TaskUid>),
     Cordon,
+    /// A node's actuators are wanted by a person.
+    Hold(usize),
+    Return,
+    EStop,
+    Set(sets::Wanted),
+    Application(applications::Wanted),
 }
 
 /// A task whose creation was answered 201.
@@ -41,6 +55,8 @@ pub(crate) struct Users {
     asked: BTreeMap<u64, Asked>,
     next: u64,
     pub(crate) wishes: BTreeMap<TaskUid, Wish>,
+    pub(crate) sets: Sets,
+    pub(crate) applications: Applications,
     /// Tasks that may end by order: somebody asked for it, or fenced their node.
     pub(crate) may_end: BTreeSet<TaskUid>,
     pub(crate) writes: u64,
@@ -49,7 +65,7 @@ pub(crate) struct Users {
 }
 
 impl Users {
-    fn ask(
+    pub(crate) fn ask(
         &mut self,
         asked: Asked,
         method: &str,
@@ -91,9 +107,53 @@ impl Users {
         Some(self.ask(Asked::Delete(uid.clone()), "DELETE", path, &options))
     }
 
-    pub(crate) fn fence(&mut self, node: &str) -> (u64, Request<Body>) {
+    /// `tasks`: those that are there.
+    pub(crate) fn fence(&mut self, node: &str, tasks: Vec<TaskUid>) -> (u64, Request<Body>) {
         let path = format!("{NODES}/{node}/fence");
-        self.ask(Asked::Fence, "POST", path, &json!({"reason": "it is off"}))
+        self.ask(Asked::Fence(tasks), "POST", path, &json!({"reason": "it is off"}))
+    }
+
+    /// Somebody wants to hold a robot: what is free, or from whoever has it.
+    pub(crate) fn hold(
+        &mut self,
+        (index, lease): (usize, &str),
+        take: bool,
+        dice: &mut Dice,
+    ) -> (u64, Request<Body>) {
+        let person = dice.pick(&PEOPLE).copied().unwrap_or("ada");
+        let verb = if take { "take" } else { "acquire" };
+        self.of_lease(Asked::Hold(index), (lease, verb), person)
+    }
+
+    /// Whoever holds a robot gives it back.
+    pub(crate) fn give_back(&mut self, lease: &str, person: &str) -> (u64, Request<Body>) {
+        self.of_lease(Asked::Return, (lease, "return"), person)
+    }
+
+    fn of_lease(
+        &mut self,
+        asked: Asked,
+        (lease, verb): (&str, &str),
+        person: &str,
+    ) -> (u64, Request<Body>) {
+        let path = format!("{LEASES}/{lease}/{verb}");
+        let (id, mut request) = self.ask(asked, "POST", path, &json!({"reason": "it is needed"}));
+        request.extensions_mut().insert(Identity::Admin { name: person.to_owned() });
+        (id, request)
+    }
+
+    /// A robot is stopped, or released up to a stop of its own.
+    pub(crate) fn estop(
+        &mut self,
+        node: &str,
+        tier: EStopTier,
+        release: Option<u64>,
+    ) -> (u64, Request<Body>) {
+        let mut patch = json!({"spec": {"estop": tier}});
+        if let Some(number) = release {
+            patch["spec"]["estopRelease"] = json!(number);
+        }
+        self.ask(Asked::EStop, "PATCH", format!("{NODES}/{node}"), &patch)
     }
 
     pub(crate) fn cordon(&mut self, node: &str, on: bool) -> (u64, Request<Body>) {
@@ -128,7 +188,9 @@ impl Users {
             Asked::Delete(uid) => {
                 self.wishes.get_mut(uid).into_iter().for_each(|wish| wish.told_to_go = true);
             }
-            Asked::Fence | Asked::Cordon => {}
+            Asked::Set(wanted) => self.sets.answered(wanted, body),
+            Asked::Application(wanted) => self.applications.answered(wanted, body),
+            Asked::Fence(_) | Asked::Cordon | Asked::Hold(_) | Asked::Return | Asked::EStop => {}
         }
         Some(asked)
     }

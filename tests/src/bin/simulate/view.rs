@@ -4,12 +4,14 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use muster_api::id::TaskUid;
+use muster_api::kind::application::Application;
 use muster_api::kind::framework::Framework;
-use muster_api::kind::lease::Lease;
+use muster_api::kind::lease::{HolderKind, Lease, LeaseHolder};
 use muster_api::kind::node::Node;
 use muster_api::kind::task::Task;
+use muster_api::kind::taskset::TaskSet;
 use muster_api::phase::TaskPhase;
-use muster_controller::objects::{FRAMEWORKS, LEASES, NODES, TASKS};
+use muster_controller::objects::{APPLICATIONS, FRAMEWORKS, LEASES, NODES, TASK_SETS, TASKS};
 use muster_controller::store::{Key, Resource, Store, Stored};
 use serde::de::DeserializeOwned;
 
@@ -74,10 +76,14 @@ pub(crate) struct View {
     pub(crate) nodes: Kind<Node>,
     pub(crate) leases: Kind<Lease>,
     pub(crate) frameworks: Kind<Framework>,
+    pub(crate) sets: Kind<TaskSet>,
+    pub(crate) applications: Kind<Application>,
     /// Tasks of frameworks that are there: their names, and the uids of their owners.
     pub(crate) owners: BTreeMap<TaskUid, (String, String)>,
     /// The highest epoch that each lease ever had.
     epochs: BTreeMap<Key, u64>,
+    /// By node the newest grant to a person: what was granted before never counts again.
+    pub(crate) fences: BTreeMap<String, u64>,
     /// What changed at the last look, for the log.
     pub(crate) news: Vec<String>,
     /// Since when a task waits without a reason, milliseconds.
@@ -92,8 +98,11 @@ impl Default for View {
             nodes: Kind::new(NODES),
             leases: Kind::new(LEASES),
             frameworks: Kind::new(FRAMEWORKS),
+            sets: Kind::new(TASK_SETS),
+            applications: Kind::new(APPLICATIONS),
             owners: BTreeMap::new(),
             epochs: BTreeMap::new(),
+            fences: BTreeMap::new(),
             news: Vec::new(),
             mute: BTreeMap::new(),
         }
@@ -121,6 +130,8 @@ impl View {
         self.nodes.follow(store)?;
         self.leases.follow(store)?;
         self.frameworks.follow(store)?;
+        self.sets.follow(store)?;
+        self.applications.follow(store)?;
         let changed = self.tasks.follow(store)?;
         self.lives_follow(changed)?;
         self.one_driver()?;
@@ -137,7 +148,7 @@ impl View {
     fn lives_follow(&mut self, changed: Vec<(Key, Option<Task>)>) -> Result<(), Violation> {
         for (key, before) in changed {
             let Some((_, _, after)) = self.tasks.objects.get(&key) else { continue };
-            if let Some(owner) = owner(after) {
+            if let Some(owner) = controller(after, "Framework") {
                 let uid = TaskUid::new(after.metadata.uid.as_deref().unwrap_or_default());
                 self.owners.insert(uid, (key.name.to_string(), owner.to_owned()));
             }
@@ -145,6 +156,12 @@ impl View {
             if was != is {
                 let on = after.status.as_ref().and_then(|s| s.node.as_deref()).unwrap_or_default();
                 self.news.push(format!("{}: {was}, now {is} {on}", key.name));
+            }
+            let grant = |task: &Task| Some(task.status.as_ref()?.lease.as_ref()?.epoch);
+            let (had, has) = (before.as_ref().and_then(grant), grant(after));
+            if had.is_some() && has.is_some() && had != has {
+                let how = format!("{key} had {had:?}, and has {has:?}");
+                return Err(Invariant::OneDriver.broken(how));
             }
             if was.is_terminal() && was != is {
                 let how = format!("{key} was {was}, and is {is}");
@@ -169,7 +186,15 @@ impl View {
                 return Err(Invariant::OneDriver.broken(how));
             }
             *highest = status.epoch.0;
-            let Some(holder) = status.holder else { continue };
+            let fence = status.fence.map_or(0, |fence| fence.0);
+            let known = self.fences.entry(lease.spec.node.clone()).or_default();
+            if fence < *known || fence > status.epoch.0 {
+                let how = format!("{key} is fenced up to {fence}, and was up to {known}");
+                return Err(Invariant::OneDriver.broken(how));
+            }
+            *known = fence;
+            let task = |holder: &LeaseHolder| holder.kind == HolderKind::Task;
+            let Some(holder) = status.holder.filter(task) else { continue };
             let held = self.tasks.all().find(|(_, uid, _)| **uid == holder.uid);
             let holds = held.is_some_and(|(_, _, task)| {
                 let status = task.status.as_ref();
@@ -189,6 +214,11 @@ impl View {
                 continue;
             };
             let Some(lease) = &status.lease else { continue };
+            // From whom a person took it, runs on without it.
+            let node = status.node.as_deref().unwrap_or_default();
+            if self.fences.get(node).is_some_and(|fence| lease.epoch.0 < *fence) {
+                continue;
+            }
             if let Some(other) = drivers.insert(&lease.name, key) {
                 let how = format!("{key} and {other} both have {}", lease.name);
                 return Err(Invariant::OneDriver.broken(how));
@@ -232,10 +262,10 @@ impl View {
     }
 }
 
-/// The framework that a task belongs to.
-pub(crate) fn owner(task: &Task) -> Option<&str> {
+/// The object of this kind that a task belongs to.
+pub(crate) fn controller<'a>(task: &'a Task, kind: &str) -> Option<&'a str> {
     let owners = task.metadata.owner_references.iter().flatten();
-    owners.filter(|owner| owner.kind == "Framework").map(|owner| &*owner.uid).next()
+    owners.filter(|owner| owner.kind == kind).map(|owner| &*owner.uid).next()
 }
 
 /// Where a task is.

@@ -1,17 +1,19 @@
 //! Everything together: one controller, its disk, machines with agents, frameworks, the network, the people; and the world's time, in
 //! milliseconds. Nothing here happens but by [`World::run_to`] and the actions.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
 use muster_api::id::TaskUid;
 use muster_api::kind::node::NodeKind;
+use muster_api::kind::task::Task;
 use muster_api::name::NodeName;
 use muster_controller::store::memory::Disk;
 
 use crate::action::Tally;
 use crate::agenda::{Agenda, Due};
 use crate::agent::{Agent, Hands, What};
+use crate::applications::Told;
 use crate::controller::{Controller, House, Member, Said, Skew};
 use crate::dice::Dice;
 use crate::framework::{Deed, Framework};
@@ -27,6 +29,22 @@ use crate::view::View;
 const IN_CIRCLES: u32 = 20_000;
 /// How long each framework may be away, milliseconds.
 const PATIENCE: [u64; 2] = [12_000, 40_000];
+
+/// Which machines have a gate: of the robots one has none.
+const GATED: [bool; 4] = [true, true, false, false];
+
+/// What there is in a run beside tasks and frameworks: not everything in each, which makes all of them slow.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Cast {
+    pub(crate) sets: bool,
+    pub(crate) applications: bool,
+}
+
+impl Cast {
+    fn of(seed: u64) -> Cast {
+        Cast { sets: seed.is_multiple_of(3), applications: seed % 3 == 1 }
+    }
+}
 
 /// The world.
 pub(crate) struct World {
@@ -47,7 +65,10 @@ pub(crate) struct World {
     pub(crate) log: Log,
     pub(crate) broken: Option<Violation>,
     pub(crate) mutation: Option<Mutation>,
+    pub(crate) cast: Cast,
     pub(crate) tally: Tally,
+    /// How far the holders of robots have counted what they handed on.
+    pub(crate) handed_on: BTreeMap<TaskUid, u32>,
     /// When a commit was last made to fail.
     pub(crate) failed_at: u64,
 }
@@ -69,8 +90,10 @@ impl World {
         let members: Vec<Member> = machines.iter().map(member).collect();
         let room = |cpu| Room { cpu, memory: 512 << 20 };
         let rooms: Vec<Room> = machines.iter().map(|(_, _, cpu)| room(*cpu)).collect();
+        let names = members.iter().map(|member| member.name.to_string()).collect();
         let agents = members.iter().zip(&rooms).enumerate();
-        let agents = agents.map(|(index, (member, room))| Agent::new(index, member.clone(), *room));
+        let agents = agents
+            .map(|(index, (member, room))| Agent::new(index, member.clone(), *room, GATED[index]));
         let frameworks = PATIENCE.iter().enumerate().map(|(number, patience)| {
             Framework::new(machines.len() + number, &format!("f{}", number + 1), *patience)
         });
@@ -89,13 +112,15 @@ impl World {
             house: House { disk, skew: Skew::default(), dir: dir.to_owned(), members },
             controller: None,
             up_since: None,
-            truth: Truth { rooms, ..Truth::default() },
+            truth: Truth::new(rooms, names, GATED.to_vec()),
             users: Users::default(),
             view: View::default(),
             log: Log::new(aloud),
             broken: None,
             mutation,
+            cast: Cast::of(seed),
             tally: Tally::default(),
+            handed_on: BTreeMap::new(),
             failed_at: 0,
         };
         world.agenda.at(0, Due::Controller);
@@ -204,6 +229,7 @@ impl World {
                 self.let_read(end);
             }
             Due::Lost(conn) => self.lost(conn),
+            Due::WellAgain => self.truth.told = Told::default(),
             Due::Controller => self.start_controller(),
             Due::Heal(node) => self.heal(node),
         }
@@ -222,6 +248,10 @@ impl World {
             (None, _) => false,
             (Some(controller), Up::Open) if node >= self.agents.len() => controller.welcome(conn),
             (Some(controller), Up::Call(call)) => controller.call(conn, *call),
+            (Some(controller), Up::Orders) => {
+                let member = &self.house.members[node];
+                controller.order(conn, &member.name, &member.key)
+            }
             (Some(controller), Up::Open) => {
                 let member = &self.house.members[node];
                 controller.connect(conn, &member.name, &member.key)
@@ -257,6 +287,10 @@ impl World {
                 let chance = (&mut self.dice, &mut self.agenda);
                 self.net.send_down(conn, Down::Message(message), self.now, chance);
             }
+            Said::Order(conn, order) => {
+                let chance = (&mut self.dice, &mut self.agenda);
+                self.net.send_down(conn, Down::Order(order), self.now, chance);
+            }
             Said::ToFramework(conn, event) => self.tell_framework(conn, event),
             Said::Closed(conn) => self.close_down(conn),
             Said::Answer(id, code, body) => {
@@ -266,6 +300,7 @@ impl World {
                     let text = String::from_utf8_lossy(&body).into_owned();
                     self.log.say(self.now, format_args!("{text}"));
                 }
+                self.is_answered(asked, code, &body);
             }
         }
     }
@@ -342,8 +377,15 @@ impl World {
         self.may_lose();
         self.ends_were_acknowledged()?;
         if self.view.revision != before {
+            if self.cast.sets {
+                self.users.sets.check(&self.view, &self.truth)?;
+            }
+            if self.cast.applications {
+                self.users.applications.check(&self.view, &self.truth)?;
+            }
             self.users.nothing_acknowledged_is_lost(&self.view)?;
         }
+        self.nobody_drives_beside()?;
         self.nobody_was_ended_for_nothing()?;
         self.whoever_waits_says_why()
     }
@@ -399,7 +441,11 @@ impl World {
             let asked = self.users.may_end.contains(&uid) || launched.is_some_and(lost);
             let status = self.view.task(&uid).and_then(|task| task.status.as_ref());
             let ordered = status.is_some_and(|s| s.stop.is_some());
-            if !asked && !ordered {
+            // A set, and an application, ends its tasks by deleting them; they may be gone already.
+            let known = self.users.wishes.contains_key(&uid) || launched.is_some();
+            let deleted = |task: &Task| task.metadata.deletion_timestamp.is_some();
+            let owned = !known && self.view.task(&uid).is_none_or(deleted);
+            if !asked && !ordered && !owned {
                 let how = format!("{uid} was told to end at {at}, and nobody wanted that");
                 return Err(Invariant::WorkOutlivesItsManagers.broken(how));
             }
@@ -422,7 +468,7 @@ impl World {
     }
 
     /// Whose tasks may end because a person said that the node is off.
-    pub(crate) fn may_end_on(&mut self, index: usize) {
+    pub(crate) fn may_end_on(&mut self, index: usize) -> Vec<TaskUid> {
         let live = self.truth.live.iter().filter(|(_, live)| live.node == index);
         let mut uids: Vec<TaskUid> = live.map(|(uid, _)| uid.clone()).collect();
         let name = self.agents[index].name();
@@ -430,6 +476,7 @@ impl World {
             task.status.as_ref().and_then(|s| s.node.as_deref()) == Some(name)
         });
         uids.extend(placed.map(|(_, uid, _)| uid.clone()));
-        self.users.may_end.extend(uids);
+        self.users.may_end.extend(uids.iter().cloned());
+        uids
     }
 }

@@ -9,8 +9,16 @@ use muster_api::id::TaskUid;
 use super::{Agent, Cell, Hands, Record, What, removed_alive};
 use crate::mutation::Mutation;
 
+/// As the real driver waits for its gate, and looks whether it may go on, milliseconds.
+const GATE_WITHIN: u64 = 5_000;
+const LOOK_EVERY: u64 = 3;
 /// Between two tries of the agent to make a record durable, milliseconds.
 const WRITE_AGAIN: u64 = 1_000;
+
+/// Whether it may connect to the gate, and with which grant it drives.
+fn seat(cell: &Cell) -> Option<Option<u64>> {
+    cell.workload.state.may_be_live().then_some(cell.kept.program.takes.drives)
+}
 
 impl Agent {
     /// Goes on with a task until it waits for something.
@@ -35,6 +43,7 @@ impl Agent {
                     );
                 }
                 cell.effects = response.effects.into();
+                self.admit(uid, seat(&cell), hands);
             } else {
                 break;
             }
@@ -46,6 +55,14 @@ impl Agent {
         if published {
             self.say_reports(hands);
             self.look_at_others(hands);
+        }
+    }
+
+    /// The gate knows whether the task may connect.
+    pub(super) fn seat(&mut self, uid: &TaskUid, hands: &mut Hands<'_>) {
+        let cell = self.life.as_ref().and_then(|life| life.tasks.get(uid));
+        if let Some(seat) = cell.map(seat) {
+            self.admit(uid, seat, hands);
         }
     }
 
@@ -88,7 +105,12 @@ impl Agent {
                 let wait = (self.booted_at + at.0).saturating_sub(hands.now).max(1);
                 hands.later(self.index, wait, wait, What::Wake(self.lives, uid.clone()));
             }
-            Effect::Launch(attempt) => self.launch(uid, attempt, hands),
+            Effect::Launch(attempt) => {
+                let wanted = self.life.as_ref().map_or(0, |life| life.hold.newest());
+                let clear = cell.kept.program.takes.drives.is_none() || self.gate.is_none();
+                let until = if clear { 0 } else { hands.now + GATE_WITHIN };
+                self.launch(uid, attempt, (wanted, until), hands);
+            }
             Effect::Watch(attempt) => {
                 let id = (uid.clone(), attempt);
                 match self.kernel.attempts.get(&id).and_then(|known| known.exit.clone()) {
@@ -133,7 +155,24 @@ impl Agent {
         hands.later(self.index, 0, 20, What::Answer(self.lives, uid.clone(), answer));
     }
 
-    fn launch(&mut self, uid: &TaskUid, attempt: u32, hands: &mut Hands<'_>) {
+    /// Starts an attempt when its gate counts what was `wanted`; `until`: it waits so long for that, 0: it need not.
+    pub(super) fn launch(
+        &mut self,
+        uid: &TaskUid,
+        attempt: u32,
+        (wanted, until): (u64, u64),
+        hands: &mut Hands<'_>,
+    ) {
+        if until > 0 && self.life.as_ref().is_none_or(|life| !life.hold.counts(wanted)) {
+            if hands.now >= until {
+                let (reason, message) = ("GateDown".to_owned(), "it does not answer".to_owned());
+                let failure = Failure { reason, message, retry: true };
+                return self.answer(uid, attempt, Outcome::LaunchFailed(failure), hands);
+            }
+            let (life, uid) = (self.lives, uid.clone());
+            let again = What::Cleared { life, uid, attempt, wanted, until };
+            return hands.later(self.index, LOOK_EVERY, LOOK_EVERY, again);
+        }
         let claim = self.kernel.claim(uid);
         let luck = hands.dice.between(0, 59);
         if luck == 0 {
@@ -195,7 +234,7 @@ impl Agent {
         if hands.mutation == Some(Mutation::DeafToStops) {
             return;
         }
-        if drives && hands.mutation == Some(Mutation::DoubleLease) {
+        if drives.is_some() && hands.mutation == Some(Mutation::DoubleLease) {
             let (oom_killed, disconnected) = (false, false);
             let (started_at, finished_at) = (Some(started), wall);
             let end = End::Signaled(9);

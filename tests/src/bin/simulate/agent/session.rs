@@ -10,8 +10,10 @@ use muster_agent_core::journal::Journal;
 use muster_agent_core::plan::{self, Step};
 use muster_agent_core::time::Boot;
 use muster_agent_core::workload::{Fetch, Workload};
+use muster_api::condition::{ACTUATORS_FENCED, Condition};
 use muster_api::id::TaskUid;
 use muster_api::kind::node::RuntimeStatus;
+use muster_api::name::FunctionName;
 use muster_api::pose::Pose;
 use muster_api::quantity::{Bytes, MilliCpu};
 use muster_api::resource::Compute;
@@ -20,6 +22,7 @@ use muster_api::wire::agent_session::NodeReport;
 use proto::agent_message::Body as Say;
 use proto::controller_message::Body as Hear;
 
+use super::gate::Hold;
 use super::{Agent, Cell, Hands, What};
 use crate::mutation::Mutation;
 use crate::net::{Conn, Down, Up};
@@ -28,6 +31,17 @@ use crate::net::{Conn, Down, Up};
 pub(super) const PAUSE: (u64, u64) = (50, 5_000);
 /// A connection on which nothing was heard for this long is given up.
 const DEAF_AFTER: u64 = 10_000;
+
+/// With a planted fault: what stands by does not wait for as long as it is told.
+fn begin_soon(assignment: &mut proto::Assignment) {
+    let Ok(mut spec) = serde_json::from_slice::<serde_json::Value>(&assignment.spec) else {
+        return;
+    };
+    if let Some(standby) = spec.get_mut("standby") {
+        standby["after"] = "1s".into();
+        assignment.spec = spec.to_string().into_bytes().into();
+    }
+}
 
 /// One session.
 #[derive(Debug)]
@@ -43,6 +57,14 @@ pub(super) struct Session {
     beats: BTreeMap<u64, Boot>,
     beat: u64,
     last_heard: u64,
+    /// Of the newest heartbeat that was answered, milliseconds.
+    round_trip: Option<u64>,
+    /// What it said of the node last, but for where that is.
+    node: proto::NodeState,
+}
+
+fn without_pose(state: &proto::NodeState) -> proto::NodeState {
+    proto::NodeState { pose: None, ..state.clone() }
 }
 
 impl Session {
@@ -64,7 +86,8 @@ impl Agent {
         }
         let conn = hands.net.open(self.index);
         let hello_at = self.clock(hands.now);
-        let state = Some(self.state(hands));
+        let state = self.state(hands);
+        let node = without_pose(&state);
         let Some(life) = &mut self.life else { return };
         let told = life.tasks.iter().filter_map(|(uid, cell)| Some((uid, cell.told.as_ref()?)));
         let hello: Vec<(TaskUid, u64)> =
@@ -73,7 +96,7 @@ impl Agent {
             node: self.member.name.to_string(),
             incarnation: format!("{}-{}", self.boot, self.lives),
             version: "simulated".to_owned(),
-            state,
+            state: Some(state),
             tasks: told.map(|(uid, report)| report_to_wire(uid, report)).collect(),
         };
         life.session = Some(Session {
@@ -86,6 +109,8 @@ impl Agent {
             beats: BTreeMap::new(),
             beat: 0,
             last_heard: hands.now,
+            round_trip: None,
+            node,
         });
         hands.net.send_up(conn, Up::Open, hands.now, (hands.dice, hands.agenda));
         self.say(Say::Hello(message), hands);
@@ -102,23 +127,48 @@ impl Agent {
             version: String::new(),
             message: String::new(),
         };
-        proto::NodeState::from(&NodeReport {
+        let hold = self.life.as_ref().map(|life| &life.hold);
+        let actuators: Vec<FunctionName> = functions(&self.actuators);
+        let (conditions, estop) = match (&self.gate, hold) {
+            (Some(_), Some(hold)) => {
+                (hold.standing().conditions(&actuators), hold.standing().estop())
+            }
+            _ if actuators.is_empty() => (Vec::new(), None),
+            _ => (vec![Condition::new(ACTUATORS_FENCED, false, "NoGate", String::new())], None),
+        };
+        let mut state = proto::NodeState::from(&NodeReport {
             kind: self.member.kind,
             labels: BTreeMap::new(),
             capacity: all.clone(),
             allocatable: all,
             sensors: functions(&self.sensors),
-            actuators: self.actuators.iter().filter_map(|text| text.parse().ok()).collect(),
+            actuators,
             pose: self.pose(),
             runtimes: vec![runtime],
-            conditions: Vec::new(),
+            conditions,
             speed: None,
             address: String::new(),
             battery: None,
             mission_locks: Vec::new(),
-            estop: None,
+            estop,
             images: Vec::new(),
-        })
+        });
+        state.person_epoch = hold.map_or(0, Hold::person_epoch);
+        state
+    }
+
+    /// Says what the node is, when that is news.
+    pub(super) fn say_node(&mut self, hands: &mut Hands<'_>) {
+        if !self.is_connected() {
+            return;
+        }
+        let state = self.state(hands);
+        let session = self.life.as_mut().and_then(|life| life.session.as_mut());
+        let Some(session) = session.filter(|session| session.node != without_pose(&state)) else {
+            return;
+        };
+        session.node = without_pose(&state);
+        self.say(Say::Node(state), hands);
     }
 
     fn pose(&self) -> Option<Pose> {
@@ -210,10 +260,28 @@ impl Agent {
         session.beat += 1;
         session.beats.insert(session.beat, at);
         let (sequence, interval) = (session.beat, session.interval);
-        let heartbeat = proto::Heartbeat { sequence, ..proto::Heartbeat::default() };
+        let link = session
+            .round_trip
+            .map(|millis| proto::Link { round_trip_usec: millis * 1_000, late_permille: 0 });
+        let usage = self.told(hands);
+        let heartbeat = proto::Heartbeat { sequence, usage, link, ..proto::Heartbeat::default() };
         self.say(Say::Heartbeat(heartbeat), hands);
         self.say_reports(hands);
         hands.later(self.index, interval, interval, What::Beat(self.lives, conn));
+    }
+
+    /// What programs tell of topics and signals.
+    fn told(&self, hands: &Hands<'_>) -> Vec<proto::TaskUsage> {
+        let told = hands.truth.told;
+        let live = self.kernel.attempts.iter();
+        let tell = live.filter(|(_, attempt)| attempt.program.tells && attempt.exit.is_none());
+        let say = |name: &str, value| proto::Told { name: name.to_owned(), value };
+        tell.map(|((uid, _), _)| proto::TaskUsage {
+            uid: uid.to_string(),
+            usage: None,
+            told: vec![say("/image", told.hz), say("tilt", told.tilt)],
+        })
+        .collect()
     }
 
     pub(super) fn say_reports(&mut self, hands: &mut Hands<'_>) {
@@ -238,6 +306,9 @@ impl Agent {
 
     /// Something of the controller arrives.
     pub(crate) fn hear(&mut self, conn: Conn, what: Down, hands: &mut Hands<'_>) {
+        if self.hear_orders(conn, &what, hands) {
+            return;
+        }
         let session = self.life.as_mut().and_then(|life| life.session.as_mut());
         let Some(session) = session.filter(|session| session.conn == conn) else { return };
         session.last_heard = hands.now;
@@ -245,8 +316,8 @@ impl Agent {
         let body = match what {
             Down::End => return self.redial(begun, 0, hands),
             Down::Message(message) => message.body,
-            // To frameworks alone.
-            Down::Event(_) => return,
+            // On other connections.
+            Down::Event(_) | Down::Order(_) => return,
         };
         match body {
             Some(Hear::Welcome(welcome)) => {
@@ -262,12 +333,17 @@ impl Agent {
                     self.tell(&uid, Event::Tick, hands);
                 }
                 self.beat(conn, hands);
+                self.say_node(hands);
             }
             Some(Hear::Assignments(assignments)) => self.assign(assignments, hands),
             Some(Hear::Heartbeat(answer)) => {
                 let sent = session.beats.remove(&answer.sequence);
                 session.beats.retain(|sequence, _| *sequence > answer.sequence);
-                sent.into_iter().for_each(|sent| self.made_contact(sent));
+                if let Some(sent) = sent {
+                    let now = hands.now.saturating_sub(self.booted_at);
+                    session.round_trip = Some(now.saturating_sub(sent.0));
+                    self.made_contact(sent);
+                }
             }
             Some(Hear::Task(answer)) => {
                 let uid = TaskUid::new(answer.uid);
@@ -280,16 +356,19 @@ impl Agent {
         }
     }
 
-    fn assign(&mut self, message: proto::Assignments, hands: &mut Hands<'_>) {
+    fn assign(&mut self, mut message: proto::Assignments, hands: &mut Hands<'_>) {
         let context = self.context(hands);
         let Some(life) = &mut self.life else { return };
+        if hands.mutation == Some(Mutation::HastyStandby) {
+            message.upserts.iter_mut().for_each(begin_soon);
+        }
         for upsert in &message.upserts {
             if let Some(framework) = &upsert.framework {
                 let uid = TaskUid::new(upsert.uid.as_str());
                 hands.truth.launched.insert(uid, framework.id.clone());
             }
         }
-        let keep = |wire: &proto::Assignment, spec| Agent::kept(&wire.name, &spec);
+        let keep = |wire: &proto::Assignment, spec| Agent::kept(wire, &spec);
         let (assignments, mut kept) = decode(message, |uid| life.tasks.contains_key(uid), keep);
         let known = life.tasks.iter().map(|(uid, cell)| (uid.clone(), cell.forgotten)).collect();
         let mut told = Vec::new();
