@@ -37,7 +37,7 @@ pub(crate) async fn robot(points: &[Failpoint]) {
     file("world.yaml", WORLD);
     let config = file("agent.yaml", AGENT).display().to_string();
     let flags = vec!["--config".to_owned(), config];
-    let options = AgentOptions { name: "robot".to_owned(), flags };
+    let options = AgentOptions { flags, ..AgentOptions::bare("robot") };
     cluster.join(options.flag("--docker-socket", "none")).await;
     for (number, moment) in moments(points).into_iter().enumerate() {
         let crash = Crash::at(&mut cluster, "robot", moment, 1);
