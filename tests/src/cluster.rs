@@ -81,12 +81,7 @@ impl AgentOptions {
     /// One that says nothing of itself.
     #[must_use]
     pub fn bare(name: &str) -> Self {
-        AgentOptions {
-            name: name.to_owned(),
-            flags: Vec::new(),
-            data_dir: None,
-            namespace: None,
-        }
+        AgentOptions { name: name.to_owned(), flags: Vec::new(), data_dir: None, namespace: None }
     }
 
     /// A cloud server.

@@ -161,30 +161,31 @@ async fn kill_all(house: &mut House, dice: &mut Dice) {
     house.cluster.start_controller().await;
 }
 
-/// Kills the program of a resident, or the process above it: it is started anew, once.
-async fn hit(fault: Fault, house: &mut House, node: &str, report: &mut Report) {
-    let name = residents::keeps(node);
-    let Some((uid, attempt)) = witness::starts(house, &name).pop() else { return };
+/// Kills the program of a task, or the process above it: it is started anew, once.
+async fn hit(fault: Fault, house: &House, node: &str, report: &mut Report) {
+    let Some(uid) = residents::victim(house, node).await else {
+        report.broken("no task that could be hit comes to run".to_owned());
+        return;
+    };
     let programs = kernel::with_env("MUSTER_UID", &uid);
     let victims = match fault {
         Fault::KillProgram => programs.iter().map(|program| program.pid).collect(),
         _ => processes(&["shim", &uid]),
     };
-    if victims.len() != 1 {
-        report.broken(format!("{name} has {} processes to kill, not one", victims.len()));
-        return;
-    }
-    *house.hits.entry(name.clone()).or_default() += 1;
-    kernel::kill(victims[0]);
-    let next = (uid, attempt + 1);
-    let begun = Instant::now();
-    while witness::starts(house, &name).last() != Some(&next) {
-        if begun.elapsed() > DEADLINE {
-            report.broken(format!("{name} is not started anew {DEADLINE:?} after {fault}"));
-            return;
+    if victims.len() == 1 {
+        kernel::kill(victims[0]);
+        let (begun, both) = (Instant::now(), [(uid.clone(), 1), (uid.clone(), 2)]);
+        while !witness::starts(house, "victim").ends_with(&both) {
+            if begun.elapsed() > DEADLINE {
+                report.broken(format!("not started anew {DEADLINE:?} after {fault}"));
+                break;
+            }
+            tokio::time::sleep(Duration::from_millis(10)).await;
         }
-        tokio::time::sleep(Duration::from_millis(10)).await;
+    } else {
+        report.broken(format!("{} processes to kill, not one", victims.len()));
     }
+    house.cluster.delete("victim").await;
 }
 
 /// Kills a robot's gate: the first thing that its driver hears of the next one is the stop.

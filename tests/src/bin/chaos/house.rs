@@ -41,8 +41,6 @@ pub(crate) struct House {
     pub(crate) client: Client,
     /// Creating and starting a container takes the engine so long without anybody else.
     pub(crate) container: Duration,
-    /// How often each resident was hit by what must start it anew.
-    pub(crate) hits: std::collections::BTreeMap<String, usize>,
 }
 
 /// What an agent has.
@@ -152,10 +150,9 @@ impl House {
             fs::create_dir_all(witness.join(dir)).expect("the test's directory");
         }
         let client = cluster.client().await;
-        let hits = std::collections::BTreeMap::new();
         let container = Duration::ZERO;
         let mut house =
-            House { cluster, machines: Vec::new(), witness, disk, clock, client, container, hits };
+            House { cluster, machines: Vec::new(), witness, disk, clock, client, container };
         house.add(AgentOptions::robot("robot-1", 0.0, 0.0), None).await;
         house.add(AgentOptions::robot("robot-2", 5.0, 0.0), Some(Disk::new())).await;
         house.add(AgentOptions::cloud("cloud-1"), None).await;

@@ -5,7 +5,7 @@
 
 use std::collections::BTreeMap;
 use std::fmt;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
@@ -16,6 +16,7 @@ use muster_api::kind::task::Task;
 use muster_api::phase::TaskPhase;
 use serde_json::json;
 use tokio::task::JoinHandle;
+use tokio::time::MissedTickBehavior;
 use tokio_util::sync::CancellationToken;
 
 use crate::house::{DEADLINE, Dice, House, PATIENCE};
@@ -23,6 +24,8 @@ use crate::report::Report;
 
 /// Between two writes.
 const PAUSE: Duration = Duration::from_millis(40);
+/// Between two looks at what has ended.
+const LOOK: Duration = Duration::from_millis(500);
 /// Short tasks that are there at once.
 const CROWD: usize = 8;
 /// ConfigMaps that are changed over and over.
@@ -35,6 +38,8 @@ struct Book {
     tasks: BTreeMap<String, Short>,
     counters: BTreeMap<usize, Counter>,
     wrote: Wrote,
+    /// What must not be, and was seen between two checks.
+    broken: Vec<String>,
 }
 
 /// A task that ends by itself.
@@ -95,13 +100,13 @@ impl Writer {
         }
         let stopped = stop.clone();
         let task = tokio::spawn(async move {
-            tokio::select! { () = pen.write() => {} () = stopped.cancelled() => {} }
+            tokio::select! {
+                () = pen.write() => {}
+                () = pen.read() => {}
+                () = stopped.cancelled() => {}
+            }
         });
         Writer { book, client: house.client.clone(), starts, stop, task }
-    }
-
-    fn tasks(&self) -> Api<Task> {
-        Api::namespaced(self.client.clone(), "default")
     }
 
     /// Everything that was acknowledged is there, and nothing that was acknowledged to be gone.
@@ -120,7 +125,7 @@ impl Writer {
         }
         let begun = Instant::now();
         loop {
-            let found = self.list().await;
+            let found = list(&self.client).await;
             let lost: Vec<_> = {
                 let book = self.book.lock().expect("nobody panics with it");
                 let still = |name: &String| book.tasks.get(name).is_some_and(|s| !s.leaves);
@@ -134,7 +139,7 @@ impl Writer {
                 report.broken(format!("{name} was acknowledged, and is not there"));
                 self.book.lock().expect("nobody panics with it").tasks.remove(&name);
             }
-            self.look(&found, report);
+            look(&self.book, &self.starts, &found);
             let left = away.iter().find(|name| found.contains_key(*name));
             let Some(left) = left else { break };
             if begun.elapsed() > DEADLINE {
@@ -147,55 +152,9 @@ impl Writer {
         for name in away {
             book.tasks.remove(&name);
         }
+        std::mem::take(&mut book.broken).into_iter().for_each(|how| report.broken(how));
         drop(book);
         self.check_counters(report).await;
-    }
-
-    /// All short tasks, as soon as the controller says.
-    async fn list(&self) -> BTreeMap<String, Task> {
-        let begun = Instant::now();
-        loop {
-            let asked = self.tasks();
-            let wanted = ListParams::default().labels(LABEL);
-            let list = tokio::time::timeout(PATIENCE, asked.list(&wanted)).await;
-            match list {
-                Ok(Ok(list)) => {
-                    let named = |task: Task| Some((task.metadata.name.clone()?, task));
-                    return list.items.into_iter().filter_map(named).collect();
-                }
-                other => assert!(begun.elapsed() < DEADLINE, "no list of tasks: {other:?}"),
-            }
-        }
-    }
-
-    /// Those that have ended did so as they were made to.
-    fn look(&self, found: &BTreeMap<String, Task>, report: &mut Report) {
-        let starts = std::fs::read_to_string(&self.starts).unwrap_or_default();
-        let mut book = self.book.lock().expect("nobody panics with it");
-        let mut ended = 0;
-        for (name, task) in found {
-            let Some(short) = book.tasks.get_mut(name) else { continue };
-            let Some(status) = task.status.as_ref().filter(|s| s.phase.is_terminal()) else {
-                continue;
-            };
-            if short.ended || task.metadata.deletion_timestamp.is_some() {
-                continue;
-            }
-            short.ended = true;
-            ended += 1;
-            let phase = if short.code == 0 { TaskPhase::Succeeded } else { TaskPhase::Failed };
-            if (status.phase, status.exit_code) != (phase, Some(short.code)) {
-                let (code, told) =
-                    (short.code, (status.phase, status.exit_code, &status.reason, &status.message));
-                report.broken(format!("{name} ends with {code}, and is told as {told:?}"));
-            }
-            let uid = task.metadata.uid.as_deref().unwrap_or_default();
-            let times = starts.lines().filter(|line| line.split(' ').next() == Some(uid)).count();
-            if times != 1 {
-                report.broken(format!("{name} ({uid}) was started {times} times"));
-            }
-        }
-        book.wrote.ended += ended;
     }
 
     async fn check_counters(&self, report: &mut Report) {
@@ -234,7 +193,7 @@ impl Writer {
                     })
                     .map(|(name, task)| format!("{name}: {:?}", task.status))
             };
-            let Some(waits) = waits(&self.list().await) else { break };
+            let Some(waits) = waits(&list(&self.client).await) else { break };
             if begun.elapsed() > DEADLINE {
                 report.broken(format!("not ended {DEADLINE:?} after the last fault: {waits}"));
                 break;
@@ -244,6 +203,49 @@ impl Writer {
         self.check(report).await;
         let _ = self.task.await;
         self.book.lock().expect("nobody panics with it").wrote
+    }
+}
+
+/// All short tasks, as soon as the controller says.
+async fn list(client: &Client) -> BTreeMap<String, Task> {
+    let tasks: Api<Task> = Api::namespaced(client.clone(), "default");
+    let (begun, wanted) = (Instant::now(), ListParams::default().labels(LABEL));
+    loop {
+        match tokio::time::timeout(PATIENCE, tasks.list(&wanted)).await {
+            Ok(Ok(list)) => {
+                let named = |task: Task| Some((task.metadata.name.clone()?, task));
+                return list.items.into_iter().filter_map(named).collect();
+            }
+            other => assert!(begun.elapsed() < DEADLINE, "no list of tasks: {other:?}"),
+        }
+    }
+}
+
+/// Those that have ended did so as they were made to.
+fn look(book: &Mutex<Book>, starts: &Path, found: &BTreeMap<String, Task>) {
+    let starts = std::fs::read_to_string(starts).unwrap_or_default();
+    let mut book = book.lock().expect("nobody panics with it");
+    for (name, task) in found {
+        let Some(short) = book.tasks.get_mut(name) else { continue };
+        let ended = task.status.as_ref().filter(|status| status.phase.is_terminal());
+        let Some(status) = ended.filter(|_| task.metadata.deletion_timestamp.is_none()) else {
+            continue;
+        };
+        if std::mem::replace(&mut short.ended, true) {
+            continue;
+        }
+        let code = short.code;
+        book.wrote.ended += 1;
+        let phase = if code == 0 { TaskPhase::Succeeded } else { TaskPhase::Failed };
+        if (status.phase, status.exit_code) != (phase, Some(code)) {
+            let told = (status.phase, status.exit_code, &status.reason, &status.message);
+            book.broken.push(format!("{name} ends with {code}, and is told as {told:?}"));
+        }
+        let uid = task.metadata.uid.as_deref().unwrap_or_default();
+        let times = starts.lines().filter(|line| line.split(' ').next() == Some(uid)).count();
+        if times != 1 {
+            book.broken.push(format!("{name} ({uid}) was started {times} times"));
+        }
     }
 }
 
@@ -258,7 +260,7 @@ impl Pen {
     async fn write(&self) {
         let mut dice = Dice::new(42);
         let mut ticks = tokio::time::interval(PAUSE);
-        ticks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
+        ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
         for number in 0_u64.. {
             ticks.tick().await;
             match dice.below(4) {
@@ -266,6 +268,16 @@ impl Pen {
                 1 => self.delete(&mut dice).await,
                 _ => self.create(number, &mut dice).await,
             }
+        }
+    }
+
+    /// Looks at what has ended; others can take its place then.
+    async fn read(&self) {
+        let mut ticks = tokio::time::interval(LOOK);
+        ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
+        loop {
+            ticks.tick().await;
+            look(&self.book, &self.starts, &list(&self.client).await);
         }
     }
 
