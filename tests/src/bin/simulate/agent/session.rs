@@ -39,7 +39,7 @@ fn begin_soon(assignment: &mut proto::Assignment) {
     };
     if let Some(standby) = spec.get_mut("standby") {
         standby["after"] = "1s".into();
-        assignment.spec = spec.to_string().into_bytes().into();
+        assignment.spec = spec.to_string().into_bytes();
     }
 }
 
