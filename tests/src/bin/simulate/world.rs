@@ -44,8 +44,13 @@ pub(crate) struct Cast {
 const SHARE: u64 = 8;
 
 impl Cast {
-    fn of(seed: u64) -> Cast {
-        Cast { sets: seed.is_multiple_of(SHARE), applications: seed % SHARE == SHARE / 2 }
+    /// A planted fault has what it is planted in.
+    fn of(seed: u64, mutation: Option<Mutation>) -> Cast {
+        let share = seed % SHARE;
+        Cast {
+            sets: share == 0 || mutation == Some(Mutation::HastyRollout),
+            applications: share == SHARE / 2 || mutation == Some(Mutation::HastyStandby),
+        }
     }
 }
 
@@ -121,7 +126,7 @@ impl World {
             log: Log::new(aloud),
             broken: None,
             mutation,
-            cast: Cast::of(seed),
+            cast: Cast::of(seed, mutation),
             tally: Tally::default(),
             handed_on: BTreeMap::new(),
             failed_at: 0,

@@ -168,6 +168,12 @@ impl Agent {
             return;
         };
         session.node = without_pose(&state);
+        let (name, person) = (&self.member.name, state.person_epoch);
+        let stopped = state.estop.as_ref().map(|estop| estop.tier);
+        hands.log.say(
+            hands.now,
+            format_args!("{name} says how its gate stands: stopped {stopped:?}, person {person}"),
+        );
         self.say(Say::Node(state), hands);
     }
 
