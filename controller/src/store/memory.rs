@@ -3,7 +3,7 @@
 //! A [`Disk`] outlives the stores that are opened on it, as a file outlives its controller. A batch is on it whole or not
 //! at all, some time before it is answered: whoever is killed in between does not know which.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashSet};
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
@@ -71,6 +71,21 @@ impl Disk {
     /// for the next who opens it.
     pub fn sync_every(&self, commits: u64) {
         self.kept().synced_every = commits;
+    }
+
+    /// Forgets what is not the newest of its object any more, as a compaction does that takes in everything that is synced.
+    pub fn compact(&self) {
+        let mut kept = self.kept();
+        let through = kept.synced;
+        let mut there = HashSet::new();
+        let of = |row: &Row| (row.resource.clone(), row.namespace.clone(), row.name.clone());
+        let old = kept.rows.iter().rev().filter(|(revision, row)| {
+            let newest = there.insert(of(row));
+            **revision <= through && (!newest || row.deleted)
+        });
+        let old: Vec<u64> = old.map(|(revision, _)| *revision).collect();
+        old.iter().for_each(|revision| drop(kept.rows.remove(revision)));
+        kept.compacted = kept.compacted.max(through);
     }
 
     /// The store as it is on the disk, and its writer to run. One at a time: who opens a second one has killed the first.
@@ -180,4 +195,35 @@ pub async fn start() -> Store {
     // Owned by the store: it ends when the last handle is dropped.
     drop(tokio::spawn(writer.run(CancellationToken::new())));
     store
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::super::{Key, Op, Precondition, Resource};
+    use super::*;
+
+    #[tokio::test]
+    async fn what_was_compacted_is_what_it_was() {
+        let key = |name: &str| Key::cluster(Resource::new("nodes"), name);
+        let disk = Disk::default();
+        let (store, writer) = disk.open().await;
+        let runs = tokio::spawn(writer.run(CancellationToken::new()));
+        for name in ["a", "b"] {
+            let object = json!({"metadata": {"name": name, "uid": name}});
+            store.apply_one(Op::create(key(name), object)).await.unwrap();
+        }
+        let gone = Op::Delete { key: key("b"), precondition: Precondition::Any };
+        store.apply_one(gone).await.unwrap();
+        let (before, revision) = (store.get(&key("a")).unwrap(), store.revision());
+        drop(store);
+        runs.await.unwrap();
+        disk.compact();
+        assert_eq!(disk.kept().rows.len(), 1);
+        let (store, _writer) = disk.open().await;
+        assert_eq!(store.revision(), revision);
+        assert_eq!(store.get(&key("a")).unwrap().bytes, before.bytes);
+        assert!(store.get(&key("b")).is_none());
+    }
 }

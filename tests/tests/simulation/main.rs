@@ -106,6 +106,11 @@ fn a_rollout_that_takes_too_much_down_is_found() {
 }
 
 #[test]
+fn a_part_that_a_robot_begins_too_soon_is_found() {
+    is_found_within("12000", "hasty-standby", &["nothing_runs_twice"]);
+}
+
+#[test]
 fn no_run_begins_when_the_time_is_over() {
     let (well, said) = simulate(&["--steps", "400", "--run", "10", "--within", "0"]);
     assert!(well && said.contains("0 runs, 0 steps"), "{said}");

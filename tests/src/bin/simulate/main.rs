@@ -10,12 +10,12 @@
 //! |---|---|
 //! | the controller but its port: REST handlers, every reconciler, sessions, the store with its one writer | the disk under the store; TLS and gRPC: messages are handed over |
 //! | the agent's core: workloads, restarts, plans of assignments, the journal; decoding of assignments, reports | the agent's driver, supervisor and link, which carry out what the core decides; shims, kernels, disks |
+//! | the gate's core; what the agent wants of its gate, and tells of its standing | the gate's process, its disk and connections; drivers |
 //!
 //! One seed and one number of steps are one run, whatever else the machine does: time stands until somebody waits for it, and
 //! randomness is the seed's (see [`dice`]). So a run is repeated by its seed, and shortened by leaving steps out.
 //!
-//! Not in it: executors, TaskSets, probes, containers, gates and their commands (invariant 1's first half is
-//! held by the gate's own tests), applications, and quotas as the kernel measures them (invariant 7).
+//! Not in it: executors, probes, containers and images, mission locks, and quotas as the kernel measures them (invariant 7).
 
 mod action;
 mod agenda;

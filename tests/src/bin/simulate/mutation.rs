@@ -29,8 +29,6 @@ pub(crate) enum Mutation {
     DeafToStops,
     /// An agent says that a person's grant counts, and its gate has not heard of it.
     ForgedHold,
-    /// A gate that is started again has forgotten what it kept.
-    ForgetfulGate,
     /// A set is told that its rollouts may take everything down.
     HastyRollout,
     /// A robot that is cut off begins what stands by too soon.

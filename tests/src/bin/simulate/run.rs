@@ -14,6 +14,9 @@ use crate::{dice, invariant::Violation};
 
 /// A step that takes longer than this, on whatever machine, never ends.
 const HANGS_AFTER: Duration = Duration::from_secs(120);
+/// How the C library's allocator is set up for a run.
+const TUNABLES: &str = "glibc.malloc.trim_threshold=1073741824:glibc.malloc.mmap_threshold=1073741824:\
+     glibc.malloc.top_pad=67108864:glibc.malloc.tcache_count=200";
 /// What begins the line with a run's outcome.
 const MARK: &str = "outcome ";
 
@@ -118,6 +121,8 @@ pub(crate) fn say(outcome: &Outcome) {
 /// Runs it in a process of its own; gives the log as well.
 pub(crate) fn apart(plan: &Plan, aloud: bool) -> (Outcome, String) {
     let mut command = std::process::Command::new(std::env::current_exe().expect("this program"));
+    // Memory is kept: a run asks for and gives back the same few megabytes all the time.
+    command.env("GLIBC_TUNABLES", TUNABLES);
     command.args(["--one", "--seed", &plan.seed.to_string(), "--steps", &plan.steps.to_string()]);
     if let Some(only) = &plan.only {
         let list: Vec<String> = only.iter().map(u64::to_string).collect();

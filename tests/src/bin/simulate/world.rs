@@ -40,9 +40,17 @@ pub(crate) struct Cast {
     pub(crate) applications: bool,
 }
 
+/// One run of so many has sets, and another one an application.
+const SHARE: u64 = 8;
+
 impl Cast {
-    fn of(seed: u64) -> Cast {
-        Cast { sets: seed.is_multiple_of(3), applications: seed % 3 == 1 }
+    /// A planted fault has what it is planted in.
+    fn of(seed: u64, mutation: Option<Mutation>) -> Cast {
+        let share = seed % SHARE;
+        Cast {
+            sets: share == 0 || mutation == Some(Mutation::HastyRollout),
+            applications: share == SHARE / 2 || mutation == Some(Mutation::HastyStandby),
+        }
     }
 }
 
@@ -118,7 +126,7 @@ impl World {
             log: Log::new(aloud),
             broken: None,
             mutation,
-            cast: Cast::of(seed),
+            cast: Cast::of(seed, mutation),
             tally: Tally::default(),
             handed_on: BTreeMap::new(),
             failed_at: 0,
@@ -316,6 +324,10 @@ impl World {
     pub(crate) fn crash_controller(&mut self) {
         self.controller = None;
         self.up_since = None;
+        // Whoever starts next reads every revision that was not compacted.
+        if self.dice.one_in(2) {
+            self.house.disk.compact();
+        }
         self.users.left_alone();
         for conn in self.net.all() {
             if self.dice.one_in(4) {

@@ -243,11 +243,7 @@ impl Agent {
         let Some(gate) = &mut self.gate else { return };
         if gate.hall.is_none() {
             gate.lives += 1;
-            let kept = match hands.mutation {
-                Some(Mutation::ForgetfulGate) => Kept::default(),
-                _ => gate.disk.clone(),
-            };
-            let (core, first) = Gate::start(Settings::default(), kept);
+            let (core, first) = Gate::start(Settings::default(), gate.disk.clone());
             let mut hall = Hall {
                 core,
                 seats: BTreeSet::new(),
@@ -369,8 +365,12 @@ impl Agent {
         if hold.gate != Some(gate) || hold.standing.status.as_ref() == Some(&status) {
             return;
         }
+        let told = |status: &proto::Status| (status.holder.clone(), status.estop.clone());
+        let news = hold.standing.status.as_ref().map(told) != Some(told(&status));
         hold.standing.status = Some(status);
-        self.say_node(hands);
+        if news {
+            self.say_node(hands);
+        }
     }
 
     /// Says who may connect to the gate.

@@ -39,7 +39,7 @@ fn begin_soon(assignment: &mut proto::Assignment) {
     };
     if let Some(standby) = spec.get_mut("standby") {
         standby["after"] = "1s".into();
-        assignment.spec = spec.to_string().into_bytes().into();
+        assignment.spec = spec.to_string().into_bytes();
     }
 }
 
@@ -168,6 +168,12 @@ impl Agent {
             return;
         };
         session.node = without_pose(&state);
+        let (name, person) = (&self.member.name, state.person_epoch);
+        let stopped = state.estop.as_ref().map(|estop| estop.tier);
+        hands.log.say(
+            hands.now,
+            format_args!("{name} says how its gate stands: stopped {stopped:?}, person {person}"),
+        );
         self.say(Say::Node(state), hands);
     }
 
