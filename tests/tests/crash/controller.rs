@@ -1,7 +1,7 @@
 //! The controller: its first start, what it stores, and what it writes down of who stored it.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::process::{Command, Output};
 
 use http::Request;
@@ -12,19 +12,10 @@ use muster_tests::cluster::binary;
 use muster_tests::{AgentOptions, Cluster, wait};
 use serde_json::{Value, json};
 
-use crate::crash::{Crash, moments};
-use crate::tasks::{files, is_half};
+use crate::crash::{Crash, files, moments, nothing_half};
 
 const MAPS: &str = "/api/v1/namespaces/default/configmaps";
 const TASKS: &str = "/apis/muster.dev/v1alpha1/namespaces/default/tasks";
-
-/// Files of the controller's, its kubeconfig's directory included, that only a write that was cut off leaves.
-fn nothing_half(cluster: &Cluster) {
-    let data = files(&cluster.dir().join("controller"));
-    let beside = std::fs::read_dir(cluster.dir()).expect("it is there");
-    let beside = beside.map(|entry| entry.expect("it is listed").path());
-    assert_eq!(data.into_iter().chain(beside).find(|path: &PathBuf| is_half(path)), None);
-}
 
 /// One start after the other, each of which gets a step further on what the one before has left.
 pub(crate) async fn first_start(points: &[Failpoint]) {
@@ -32,7 +23,7 @@ pub(crate) async fn first_start(points: &[Failpoint]) {
         let mut cluster = Cluster::prepare(&[]);
         die_at(&mut cluster, *point).await;
         cluster.start_controller().await;
-        nothing_half(&cluster);
+        nothing_half(cluster.dir()).await;
         cluster.join(AgentOptions::cloud("cloud").flag("--docker-socket", "none")).await;
         let secret = json!({
             "apiVersion": "v1", "kind": "Secret", "metadata": {"name": "s"}, "stringData": {"a": "b"},
@@ -48,7 +39,7 @@ pub(crate) async fn first_start(points: &[Failpoint]) {
             cluster.kill_controller();
         }
         cluster.start_controller().await;
-        nothing_half(&cluster);
+        nothing_half(cluster.dir()).await;
         let secret = cluster.get("/api/v1/namespaces/default/secrets/s").await;
         assert_eq!(secret["data"]["a"], "Yg==", "{point:?}");
         cluster.node_ready("cloud").await;

@@ -1,7 +1,7 @@
 //! A process that is to be killed at one point, and what starts it again.
 
 use std::os::unix::process::ExitStatusExt as _;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use muster_failpoint::{Failpoint, Moment, VARIABLE};
 use muster_tests::{Cluster, kernel, wait};
@@ -66,4 +66,42 @@ pub(crate) fn moments(points: &[Failpoint]) -> Vec<Moment> {
         point.steps().iter().map(move |step| Moment(point, *step))
     };
     points.iter().flat_map(steps).collect()
+}
+
+/// Waits until there is no half of a file: one that was to take the place of another, or the key that a join asks with.
+pub(crate) async fn nothing_half(dir: &Path) {
+    let half = |path: &PathBuf| {
+        let name = path.file_name().unwrap_or_default().to_string_lossy();
+        name.ends_with(".tmp") || name.ends_with(".new") || name == "asked.key"
+    };
+    wait::until("nothing half", async || match files(dir).into_iter().find(half) {
+        Some(left) => Err(left.display().to_string()),
+        None => Ok(()),
+    })
+    .await;
+}
+
+/// Files and directories below this one.
+pub(crate) fn files(dir: &Path) -> Vec<PathBuf> {
+    below(dir, &|_| true)
+}
+
+/// Directories below this one.
+pub(crate) fn directories(dir: &Path) -> Vec<PathBuf> {
+    below(dir, &Path::is_dir)
+}
+
+fn below(dir: &Path, counts: &dyn Fn(&Path) -> bool) -> Vec<PathBuf> {
+    let mut found = Vec::new();
+    // What goes meanwhile is not there.
+    for entry in std::fs::read_dir(dir).into_iter().flatten().flatten() {
+        let path = entry.path();
+        if entry.file_type().is_ok_and(|kind| kind.is_dir()) {
+            found.extend(below(&path, counts));
+        }
+        if counts(&path) {
+            found.push(path);
+        }
+    }
+    found
 }

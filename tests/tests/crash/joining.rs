@@ -1,13 +1,10 @@
 //! An agent that joins, joins anew, or renews its certificate.
 
-use std::path::Path;
-
 use muster_failpoint::{Failpoint, Moment};
 use muster_tests::{AgentOptions, Cluster};
 use serde_json::{Value, json};
 
-use crate::crash::{Crash, moments};
-use crate::tasks::{files, is_half};
+use crate::crash::{Crash, moments, nothing_half};
 
 fn cloud(name: &str) -> AgentOptions {
     AgentOptions::cloud(name).flag("--docker-socket", "none").flag("--cpu", "1")
@@ -18,12 +15,6 @@ async fn token(cluster: &Cluster, node: Option<&str>) -> String {
     let spec = json!({"spec": {"uses": 1, "nodeName": node}});
     let made = cluster.post("/apis/muster.dev/v1alpha1/jointokens", &spec).await;
     made.pointer("/status/token").and_then(Value::as_str).expect("a token").to_owned()
-}
-
-/// Half of a file, or the key that a join asks with.
-fn nothing_half(data: &Path) {
-    let left = files(data).into_iter().find(|path| is_half(path) || path.ends_with("asked.key"));
-    assert_eq!(left, None);
 }
 
 /// The same command again is enough, with the same token.
@@ -46,7 +37,7 @@ pub(crate) async fn join(points: &[Failpoint]) {
         cluster.kill_agent(&name);
         cluster.restart_agent(&name).await;
         cluster.kill_agent(&name);
-        nothing_half(&cluster.dir().join(&name));
+        nothing_half(&cluster.dir().join(&name)).await;
     }
 }
 
@@ -61,7 +52,7 @@ pub(crate) async fn join_anew(points: &[Failpoint]) {
     }
     cluster.kill_agent("node");
     cluster.restart_agent("node").await;
-    nothing_half(&cluster.dir().join("node"));
+    nothing_half(&cluster.dir().join("node")).await;
 }
 
 /// The certificate counts for the shortest time that there is, and is due after half of a minute. From then on each start
@@ -80,5 +71,5 @@ pub(crate) async fn renew(points: &[Failpoint]) {
     cluster.restart_agent("node").await;
     let data = cluster.dir().join("node");
     assert!(data.join("pki/renewed.json").exists());
-    nothing_half(&data);
+    nothing_half(&data).await;
 }

@@ -5,8 +5,7 @@ use muster_failpoint::Failpoint;
 use muster_tests::{AgentOptions, Cluster, kernel, wait};
 use serde_json::{Value, json};
 
-use crate::crash::{Crash, moments};
-use crate::tasks::{files, is_half};
+use crate::crash::{Crash, moments, nothing_half};
 
 const WORLD: &str = "
 walls:
@@ -65,8 +64,7 @@ pub(crate) async fn robot(points: &[Failpoint]) {
         reads(&cluster, &uid).await;
         cluster.delete(&name).await;
     }
-    let left = files(&cluster.dir().join("robot")).into_iter().find(|path| is_half(path));
-    assert_eq!(left, None);
+    nothing_half(&cluster.dir().join("robot")).await;
 }
 
 /// Waits until the gate has written down that this grant counts.

@@ -11,7 +11,7 @@ use muster_failpoint::{Failpoint, Moment, Step, VARIABLE};
 use muster_tests::{AgentOptions, Cluster, kernel, wait};
 use serde_json::{Value, json};
 
-use crate::crash::{Crash, moments};
+use crate::crash::{Crash, directories, files, moments, nothing_half};
 
 /// What the Secret says.
 const PASSWORD: &str = "hunter2";
@@ -85,7 +85,7 @@ impl Robot {
         let identity = std::fs::read(cluster.dir().join("robot/agent.json")).expect("it has one");
         let identity: Value = serde_json::from_slice(&identity).expect("JSON");
         let identity = identity["id"].as_str().expect("a text");
-        let mut groups = below(Path::new("/sys/fs/cgroup"), &Path::is_dir);
+        let mut groups = directories(Path::new("/sys/fs/cgroup"));
         groups.retain(|group| group.ends_with(identity));
         assert!(!groups.is_empty(), "{identity}");
         Robot { cluster, epoch: 0, tasks: 0, uids: BTreeSet::new(), groups }
@@ -111,53 +111,23 @@ impl Robot {
         let (epoch, ()) = tokio::join!(life.whole(&uid, end), crash.nurse(cluster));
         assert!(epoch > self.epoch, "{moment}: {epoch} after {}", self.epoch);
         self.epoch = epoch;
-        let mut left = self.groups.iter().flat_map(|group| below(group, &Path::is_dir));
+        let mut left = self.groups.iter().flat_map(|group| directories(group));
         let left = left.find(|group| group.to_string_lossy().contains(&uid));
         assert_eq!(left, None, "{moment}");
         self.uids.insert(uid);
     }
 
-    /// Nothing of any task is left, nor half of a file.
+    /// Nothing of any task is left, on disk or in memory, nor half of a file.
     async fn nothing_left(&self) {
         let data = self.cluster.dir().join("robot");
-        wait::until("nothing left of tasks", async || {
-            let left: Vec<PathBuf> = files(&data)
-                .into_iter()
-                .chain(files(Path::new("/run/muster")))
-                .filter(|path| {
-                    let of_task = self.uids.iter().any(|uid| path.to_string_lossy().contains(uid));
-                    of_task || path.starts_with(&data) && is_half(path)
-                })
-                .collect();
-            if left.is_empty() { Ok(()) } else { Err(format!("{left:?}")) }
-        })
-        .await;
+        nothing_half(&data).await;
+        let all = files(&data).into_iter().chain(files(Path::new("/run/muster")));
+        let of_task = |path: &PathBuf| {
+            let path = path.to_string_lossy();
+            self.uids.iter().any(|uid| path.contains(uid))
+        };
+        assert_eq!(all.into_iter().find(of_task), None);
     }
-}
-
-/// Files and directories below this one.
-pub(crate) fn files(dir: &Path) -> Vec<PathBuf> {
-    below(dir, &|_| true)
-}
-
-/// A file that was to take the place of another.
-pub(crate) fn is_half(path: &Path) -> bool {
-    path.extension().is_some_and(|extension| extension == "tmp" || extension == "new")
-}
-
-fn below(dir: &Path, counts: &dyn Fn(&Path) -> bool) -> Vec<PathBuf> {
-    let mut found = Vec::new();
-    // What goes meanwhile is not there.
-    for entry in std::fs::read_dir(dir).into_iter().flatten().flatten() {
-        let path = entry.path();
-        if entry.file_type().is_ok_and(|kind| kind.is_dir()) {
-            found.extend(below(&path, counts));
-        }
-        if counts(&path) {
-            found.push(path);
-        }
-    }
-    found
 }
 
 /// One task's life, as its user sees it and as its program writes it down.
