@@ -98,6 +98,17 @@ pub async fn change<T: DeserializeOwned>(
     }
 }
 
+/// Whether an object is still what was read, also when it is known of every write that seemed to fail whether the disk has
+/// it: who finds that nothing is to be written, and is not told of changes, must know that.
+///
+/// # Errors
+///
+/// While the disk cannot be asked.
+pub async fn is_still(store: &Store, stored: &Stored) -> Result<bool, StoreError> {
+    store.settled().await?;
+    Ok(store.get(&stored.key).is_some_and(|now| now.revision == stored.revision))
+}
+
 /// Somebody else was first; reading again shows what is now.
 #[must_use]
 pub fn is_race(error: &StoreError) -> bool {

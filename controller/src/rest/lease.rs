@@ -109,6 +109,11 @@ async fn carry_out(
         })?;
         let from = match outcome {
             Outcome::AsItWas => {
+                // They may have given it back, and were told that this failed.
+                let still = objects::is_still(&context.store, &stored).await;
+                if !still.map_err(|error| Failure::of_store(entry, name, &error))? {
+                    continue;
+                }
                 return Ok(Done { stored, lease, from: None, changed: false, robot });
             }
             Outcome::Held { mut status, from } => {

@@ -87,6 +87,9 @@ pub(crate) async fn write(
         let mut ops = Vec::new();
         if node != before {
             ops.push(objects::replace(&stored, &node));
+        } else if !objects::is_still(&context.store, &stored).await? {
+            // What its agent said before was written after all, and is not what it says now.
+            continue;
         }
         ops.extend(free_lease(context, speaker, report));
         match context.store.apply(ops).await {
@@ -205,4 +208,63 @@ pub(crate) async fn write_strays(
     })
     .await
     .map(drop)
+}
+
+#[cfg(test)]
+mod tests {
+    use muster_api::kind::node::NodeSpec;
+    use muster_api::kind::node::estop::{EStopStatus, EStopTier};
+    use muster_api::resource::Compute;
+    use tokio_util::sync::CancellationToken;
+
+    use super::*;
+    use crate::store::memory;
+
+    #[tokio::test]
+    async fn what_seemed_to_fail_and_is_there_all_the_same_is_not_what_stands_at_the_end() {
+        let (store, writer, failures) = memory::open().await;
+        let writes = tokio::spawn(writer.run(CancellationToken::new()));
+        let dir = tempfile::tempdir().expect("a directory");
+        let context = crate::context::for_tests(dir.path(), store);
+        let name = NodeName::new("r1").expect("a name");
+        let mut node = Node::new("r1", NodeSpec::new(NodeKind::Robot));
+        objects::stamp_new(&mut node.metadata, context.clock.now());
+        node.status.get_or_insert_default().agent_keys = vec!["key".to_owned()];
+        let key = objects::node_key("r1");
+        context.store.apply_one(objects::create(key.clone(), &node)).await.expect("it is new");
+        let speaker = Speaker {
+            node: name,
+            key: "key".to_owned(),
+            incarnation: Incarnation::new("1".to_owned()),
+            version: String::new(),
+        };
+        let report = |estop: Option<EStopStatus>| NodeReport {
+            kind: NodeKind::Robot,
+            labels: std::collections::BTreeMap::new(),
+            capacity: Compute::default(),
+            allocatable: Compute::default(),
+            sensors: Vec::new(),
+            actuators: Vec::new(),
+            pose: None,
+            runtimes: Vec::new(),
+            conditions: Vec::new(),
+            speed: None,
+            address: String::new(),
+            battery: None,
+            mission_locks: Vec::new(),
+            estop,
+            images: Vec::new(),
+        };
+        let cut = Some(EStopStatus { tier: EStopTier::Cut, ..EStopStatus::default() });
+        write(&context, &speaker, &report(cut.clone()), &[]).await.expect("the disk is well");
+        // Its gate is gone for a moment; the write seems to fail, and it says anew how it is.
+        failures.mislead_next(1);
+        assert!(write(&context, &speaker, &report(None), &[]).await.is_err());
+        write(&context, &speaker, &report(cut.clone()), &[]).await.expect("the disk is well");
+        context.store.settled().await.expect("the disk answers");
+        let node: Node = objects::read(&context.store.get(&key).expect("there")).expect("a Node");
+        assert_eq!(node.status.and_then(|status| status.estop), cut);
+        drop(context);
+        writes.abort();
+    }
 }
