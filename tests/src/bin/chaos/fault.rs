@@ -281,7 +281,7 @@ struct Placed {
 
 async fn placed(house: &House, set: &'static str) -> Option<Placed> {
     let task = residents::of_set(house, set).await.pop()?;
-    Some(Placed { set, uid: task.metadata.uid?, node: task.status?.node?.to_string() })
+    Some(Placed { set, uid: task.metadata.uid?, node: task.status?.node? })
 }
 
 async fn long_away(house: &mut House, dice: &mut Dice, report: &mut Report) {

@@ -124,5 +124,7 @@ impl Report {
 
 /// The longest of these.
 fn worst(all: &[Duration]) -> String {
-    all.iter().max().map_or("-".to_owned(), |most| format!("{:.0} ms", most.as_secs_f64() * 1e3))
+    all.iter()
+        .max()
+        .map_or_else(|| "-".to_owned(), |most| format!("{:.0} ms", most.as_secs_f64() * 1e3))
 }

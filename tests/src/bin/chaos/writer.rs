@@ -148,12 +148,14 @@ impl Writer {
             }
             tokio::time::sleep(Duration::from_millis(20)).await;
         }
-        let mut book = self.book.lock().expect("nobody panics with it");
-        for name in away {
-            book.tasks.remove(&name);
-        }
-        std::mem::take(&mut book.broken).into_iter().for_each(|how| report.broken(how));
-        drop(book);
+        let broken = {
+            let mut book = self.book.lock().expect("nobody panics with it");
+            for name in away {
+                book.tasks.remove(&name);
+            }
+            std::mem::take(&mut book.broken)
+        };
+        broken.into_iter().for_each(|how| report.broken(how));
         self.check_counters(report).await;
     }
 
