@@ -41,7 +41,7 @@ pub(crate) struct Cast {
 }
 
 /// One run of so many has sets, and another one an application.
-const SHARE: u64 = 8;
+const SHARE: u64 = 12;
 
 impl Cast {
     /// A planted fault has what it is planted in.
