@@ -192,7 +192,8 @@ async fn hit(fault: Fault, house: &House, node: &str, report: &mut Report) {
 async fn kill_gate(house: &House, report: &mut Report) {
     let robot = house.machine("robot-1");
     let heard = robot.heard.as_ref().expect("robots have drivers");
-    let gates = || processes(&["gate", "robot-1"]);
+    let dir = house.cluster.dir().join("robot-1").display().to_string();
+    let gates = || processes(&[&dir, "gate"]);
     let stops = || std::fs::read_to_string(heard).unwrap_or_default().lines().count();
     let (before, said) = (gates(), stops());
     if before.len() != 1 {
