@@ -243,8 +243,8 @@ async fn lost(fault: Fault, house: &House, node: &str, begun: Instant, report: &
 /// On top of the time after which a task without contact stops: then it surely has.
 const STOP_MARGIN: Duration = Duration::from_secs(15);
 
-/// How long before it was away a node may have been heard last: a heartbeat and a half.
-const LAST_HEARD: Duration = Duration::from_millis(900);
+/// How long before it was away a node may have been heard last: after that it would have counted as lost.
+const LAST_HEARD: Duration = Duration::from_secs(2);
 
 /// How a node is away.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
