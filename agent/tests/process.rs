@@ -286,6 +286,25 @@ fn a_shim_killed_while_the_agent_was_away() {
 }
 
 #[test]
+fn an_exit_code_outlasts_a_full_disk() {
+    let controller = Controller::start();
+    let agent = Agent::start(&controller);
+    controller
+        .assign("full", sh("until [ -e \"$MUSTER_RUN_DIR/go\" ]; do sleep 0.05; done; exit 9"));
+    controller.wait_running("full");
+    let dir = agent.task_dir("full");
+    // Whoever writes the record finds no room.
+    let record = dir.join("attempts/1/exit.json.tmp");
+    std::os::unix::fs::symlink("/dev/full", &record).unwrap();
+    let program = agent.main_pid("full", 1);
+    std::fs::write(dir.join("run/go"), "").unwrap();
+    until("the program's end", || (!lives(program)).then_some(()));
+    std::fs::remove_file(&record).unwrap();
+    let end = controller.wait_end("full");
+    assert_eq!((end.exit_code, end.reason.as_str()), (Some(9), "Error"), "{end:?}");
+}
+
+#[test]
 fn restarts_back_off_and_are_counted() {
     let controller = Controller::start();
     let agent = Agent::start(&controller);

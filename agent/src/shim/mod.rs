@@ -27,6 +27,7 @@ use std::fs::File;
 use std::io::{Read as _, Write};
 use std::os::fd::{AsFd, FromRawFd, OwnedFd, RawFd};
 use std::path::PathBuf;
+use std::time::Duration;
 
 use muster_agent_core::observed::{End, Exit};
 use muster_failpoint::{self as failpoint, Failpoint, Step};
@@ -126,24 +127,25 @@ fn run(dir: &AttemptDir, lock: &OwnedFd) -> Result<(), ShimError> {
         Ok(started) => started,
         Err(error) => {
             remove_group(&order);
-            dir.write_exit(&Exit {
+            let exit = Exit {
                 end: End::NotStarted { message: error.to_string() },
                 oom_killed: false,
                 disconnected: false,
                 started_at: None,
                 finished_at: clock::wall(),
-            })?;
+            };
+            write_exit(dir, &exit)?;
             tell(ENDED);
             return Ok(());
         }
     };
     let at = clock::wall();
     let process = scan::process(started.pid).unwrap_or(Process { pid: started.pid, start_time: 0 });
-    dir.write_running(&Running { process, at })?;
-    tell(RUNNING);
+    let mut birth = Birth { dir, running: Running { process, at }, told: false };
+    birth.tell();
 
     let reach = reach(&order, shim.pid, Some(started.pid));
-    let ended = watch::watch(dir, &order, &reach, started, &signals)?;
+    let ended = watch::watch(&mut birth, &order, &reach, started, &signals)?;
     let exit = Exit {
         end: ended.end,
         oom_killed: reach.oom_kills() > 0,
@@ -152,10 +154,46 @@ fn run(dir: &AttemptDir, lock: &OwnedFd) -> Result<(), ShimError> {
         finished_at: clock::wall(),
     };
     remove_group(&order);
-    dir.write_exit(&exit)?;
+    write_exit(dir, &exit)?;
+    if !birth.told {
+        tell(ENDED);
+    }
     // Held to here on purpose: whoever gets the lock finds the record.
     let _ = lock.as_fd();
     Ok(())
+}
+
+/// The record that the program runs, and the word about it to the agent.
+#[derive(Debug)]
+struct Birth<'a> {
+    dir: &'a AttemptDir,
+    running: Running,
+    told: bool,
+}
+
+impl Birth<'_> {
+    /// Whether it is written and told. A disk that is full may have room later: the program is watched meanwhile, and what
+    /// is not written is not said to run.
+    fn tell(&mut self) -> bool {
+        if !self.told && self.dir.write_running(&self.running).is_ok() {
+            tell(RUNNING);
+            self.told = true;
+        }
+        self.told
+    }
+}
+
+/// Between two tries to write on a disk that is full.
+const FULL_PAUSE: Duration = Duration::from_millis(200);
+
+/// Keeps how the attempt ended; nobody else knows it. A disk that is full is waited for.
+fn write_exit(dir: &AttemptDir, exit: &Exit) -> Result<(), FileError> {
+    loop {
+        match dir.write_exit(exit) {
+            Err(error) if error.is_full() => std::thread::sleep(FULL_PAUSE),
+            done => return done,
+        }
+    }
 }
 
 /// How the processes of an attempt are found.

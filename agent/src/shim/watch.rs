@@ -13,7 +13,7 @@ use rustix::time::{
 
 use super::output::{Log, Pump};
 use super::start::Started;
-use super::{SIGNALS, ShimError};
+use super::{Birth, FULL_PAUSE, SIGNALS, ShimError};
 use crate::clock;
 use crate::runtime::contact::ContactFile;
 use crate::runtime::process::attempt::{AttemptDir, Order};
@@ -75,12 +75,13 @@ struct Watch<'a> {
 
 /// Returns when no process of the attempt is left.
 pub(super) fn watch(
-    dir: &AttemptDir,
+    birth: &mut Birth<'_>,
     order: &Order,
     reach: &Reach,
     started: Started,
     signals: &Signals,
 ) -> Result<Ended, ShimError> {
+    let dir = birth.dir;
     let mut log = Log::open(dir.log(), order.log);
     let pump = |fd, name| Pump::new(fd, name).map_err(ShimError::system("read its output"));
     let mut pumps = [pump(started.stdout, "stdout")?, pump(started.stderr, "stderr")?];
@@ -109,6 +110,8 @@ pub(super) fn watch(
             }
             _ => watch.ladder.step(reach),
         };
+        let again = (!birth.tell()).then_some(FULL_PAUSE);
+        let pause = [pause, again].into_iter().flatten().min();
         watch.pause(signals, &mut pumps, &mut log, pause)?;
     };
     for pump in &mut pumps {
