@@ -190,7 +190,7 @@ impl Agent {
 
     /// A runtime does what it was asked.
     pub(super) fn perform(&mut self, uid: &TaskUid, effect: &Effect, hands: &mut Hands<'_>) {
-        let fails = hands.dice.one_in(40);
+        let fails = hands.dice.one_in(40) && !hands.truth.calm;
         match effect {
             Effect::Find(attempt) if fails => {
                 self.answer(uid, *attempt, Outcome::FindFailed, hands)
