@@ -109,9 +109,10 @@ impl Seen {
             all.map(|(name, node)| (name.clone(), node.clone())).collect();
         let Some(live) = context.live() else { return nodes };
         for (name, node) in &mut nodes {
-            if node.view.silent_since.is_some() {
-                node.view.silent_since = silence(context, name, now);
-            }
+            // The longer one: a robot counts from its last contact, whatever happened to the controller since.
+            let written = node.view.silent_since;
+            node.view.silent_since = written
+                .map(|since| silence(context, name, now).map_or(since, |here| here.min(since)));
             let Ok(name) = NodeName::new(name.clone()) else { continue };
             if let Some(link) = live.sessions.link(&name) {
                 node.link.round_trip = Some(link.round_trip);
