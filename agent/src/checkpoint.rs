@@ -111,7 +111,7 @@ impl Checkpoint {
     pub(crate) fn write_given(&self, uid: &TaskUid, given: &Given) -> Result<(), FileError> {
         let path = self.make_dir(uid)?.join(SEALED);
         let Some(given) = given else {
-            return remove_file(&path);
+            return durable::remove_file(&path);
         };
         let sealed = self.vault.seal(uid, given).map_err(FileError::at("seal", &path))?;
         durable::write(Failpoint::TaskGiven, &path, &sealed, 0o600, Keep::PowerCut)
@@ -136,14 +136,9 @@ impl Checkpoint {
     pub(crate) fn drop_task(&self, uid: &TaskUid) -> Result<(), FileError> {
         let dir = self.task_dir(uid);
         reach(Failpoint::TaskRemoval, Step::Before);
-        remove_file(&dir.join("task.json"))?;
+        durable::remove_file(&dir.join("task.json"))?;
         reach(Failpoint::TaskRemoval, Step::Half);
-        match fs::remove_dir_all(&dir) {
-            Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
-                return Err(FileError::at("remove", &dir)(error));
-            }
-            _ => {}
-        }
+        durable::remove_dir_all(&dir)?;
         reach(Failpoint::TaskRemoval, Step::After);
         Ok(())
     }
@@ -167,15 +162,5 @@ impl Checkpoint {
             }
         }
         Ok(records)
-    }
-}
-
-/// Removes a file that may not be there.
-fn remove_file(path: &Path) -> Result<(), FileError> {
-    match fs::remove_file(path) {
-        Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
-            Err(FileError::at("remove", path)(error))
-        }
-        _ => Ok(()),
     }
 }

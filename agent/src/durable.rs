@@ -76,6 +76,25 @@ pub(crate) fn write(
     Ok(())
 }
 
+/// Removes a file, if it is there.
+pub(crate) fn remove_file(path: &Path) -> Result<(), FileError> {
+    gone(fs::remove_file(path), path)
+}
+
+/// Removes a directory with all that is in it, if it is there.
+pub(crate) fn remove_dir_all(path: &Path) -> Result<(), FileError> {
+    gone(fs::remove_dir_all(path), path)
+}
+
+fn gone(removed: io::Result<()>, path: &Path) -> Result<(), FileError> {
+    match removed {
+        Err(error) if error.kind() != io::ErrorKind::NotFound => {
+            Err(FileError::at("remove", path)(error))
+        }
+        _ => Ok(()),
+    }
+}
+
 /// Makes the names in `dir` durable.
 pub(crate) fn sync_dir(dir: &Path) -> Result<(), FileError> {
     File::open(dir).and_then(|dir| dir.sync_all()).map_err(FileError::at("sync", dir))

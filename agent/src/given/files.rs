@@ -24,7 +24,7 @@ use muster_api::id::TaskUid;
 use muster_api::wire::agent::v1 as proto;
 use muster_failpoint::{Failpoint, Step, reach};
 
-use crate::durable::FileError;
+use crate::durable::{self, FileError};
 use crate::runtime::launch::{AttemptId, Launch, Program};
 
 /// The variable that names a process's directory.
@@ -128,12 +128,7 @@ impl Place {
         let memory = self.memory.iter().map(|memory| memory.join(uid.as_str()));
         reach(Failpoint::FilesRemoval, Step::Before);
         for path in memory.chain([self.on_disk(uid)]) {
-            match fs::remove_dir_all(&path) {
-                Err(error) if error.kind() != io::ErrorKind::NotFound => {
-                    return Err(FileError::at("remove", &path)(error));
-                }
-                _ => {}
-            }
+            durable::remove_dir_all(&path)?;
         }
         reach(Failpoint::FilesRemoval, Step::After);
         Ok(())

@@ -171,13 +171,7 @@ impl Credentials {
 
     /// It has joined: nothing is asked any more.
     pub(crate) fn settle(&self) -> Result<(), FileError> {
-        let path = self.dir.join(ASKED);
-        match std::fs::remove_file(&path) {
-            Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
-                Err(FileError::at("remove", &path)(error))
-            }
-            _ => Ok(()),
-        }
+        durable::remove_file(&self.dir.join(ASKED))
     }
 
     fn renew(&self, key: String, answer: JoinAnswer) -> Result<(), FileError> {
@@ -190,13 +184,7 @@ impl Credentials {
         // Those of an earlier join end first: a key never stands beside another's certificate.
         for (former, step) in [("node.crt", Step::Before), (RENEWED, Step::Half)] {
             reach(Failpoint::FormerJoin, step);
-            let former = self.dir.join(former);
-            match std::fs::remove_file(&former) {
-                Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
-                    return Err(FileError::at("remove", &former)(error));
-                }
-                _ => {}
-            }
+            durable::remove_file(&self.dir.join(former))?;
         }
         reach(Failpoint::FormerJoin, Step::After);
         for (point, name, text) in [

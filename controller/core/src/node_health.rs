@@ -121,6 +121,7 @@ mod tests {
         assert_eq!(health.lost(ms(9000)), [(a, ms(8400))]);
         assert_eq!(health.next_deadline(), None);
     }
+
     #[test]
     fn nobody_is_silent_for_longer_than_the_controller_can_know() {
         let ms = Duration::from_millis;

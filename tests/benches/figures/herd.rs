@@ -10,9 +10,7 @@ use std::time::{Duration, Instant};
 
 use futures::StreamExt as _;
 use futures::future::join_all;
-use http::Uri;
 use http::uri::PathAndQuery;
-use hyper_util::rt::TokioIo;
 use kube::Client;
 use kube::api::ListParams;
 use muster_api::phase::TaskPhase;
@@ -22,17 +20,15 @@ use proto::agent_message::Body as Say;
 use proto::controller_message::Body as Hear;
 use rcgen::{CertificateParams, DnType, KeyPair};
 use rustls::pki_types::pem::PemObject as _;
-use rustls::pki_types::{CertificateDer, PrivateKeyDer, ServerName};
+use rustls::pki_types::{CertificateDer, PrivateKeyDer};
 use rustls::{ClientConfig, RootCertStore};
 use serde_json::{Value, json};
-use tokio::net::TcpStream;
 use tokio::sync::{mpsc, watch};
-use tokio_rustls::TlsConnector;
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::client::Grpc;
-use tonic::transport::Endpoint;
 use tonic_prost::ProstCodec;
 
+use crate::poses::stream::dial;
 use crate::stats::{figure, millis};
 
 const AGENTS: usize = 1_000;
@@ -186,19 +182,7 @@ impl Herd {
         tls: &Arc<ClientConfig>,
         (tasks, sequence): (&mut Vec<(String, u64)>, &mut u64),
     ) -> Option<()> {
-        let address = self.address;
-        let tls = Arc::clone(tls);
-        let dial = tower::service_fn(move |_: Uri| {
-            let connector = TlsConnector::from(Arc::clone(&tls));
-            async move {
-                let stream = TcpStream::connect(address).await?;
-                stream.set_nodelay(true)?;
-                let name = ServerName::IpAddress(address.ip().into());
-                connector.connect(name, stream).await.map(TokioIo::new)
-            }
-        });
-        let endpoint = Endpoint::from_shared(format!("http://{address}")).ok()?;
-        let mut client = Grpc::new(endpoint.connect_with_connector(dial).await.ok()?);
+        let mut client = Grpc::new(dial(self.address, Arc::clone(tls)).await.ok()?);
         client.ready().await.ok()?;
         let (say, queue) = mpsc::channel(64);
         let path = PathAndQuery::from_static("/muster.agent.v1.AgentService/Session");

@@ -31,7 +31,6 @@ pub(crate) use spawn::spawn_shim;
 
 use std::collections::BTreeMap;
 use std::ffi::OsString;
-use std::fs;
 use std::io;
 use std::os::fd::OwnedFd;
 use std::path::PathBuf;
@@ -55,7 +54,7 @@ use super::cgroup::{Enforcer, Kernel};
 use super::launch::{AttemptId, Launch, Limits, Used};
 use super::{Executed, Launched, LogQuery, Runtime, RuntimeError, RuntimeStatus, logs};
 use crate::clock;
-use crate::durable::FileError;
+use crate::durable;
 use crate::exec::ends::{Ends, Invocation, Ran};
 use crate::given::files::Place;
 use attempt::{AttemptDir, LogBounds, Process, StopFile};
@@ -314,14 +313,8 @@ impl ProcessRuntime {
         let task = self.0.config.tasks.join(uid.as_str());
         reach(Failpoint::AttemptsRemoval, Step::Before);
         for part in ["attempts", "work", "run"] {
-            let path = task.join(part);
-            match fs::remove_dir_all(&path) {
-                Err(error) if error.kind() != io::ErrorKind::NotFound => {
-                    let error = FileError { action: "remove", path, source: error };
-                    return Err(RuntimeError::new("remove a task's directories", error));
-                }
-                _ => {}
-            }
+            durable::remove_dir_all(&task.join(part))
+                .map_err(|error| RuntimeError::new("remove a task's directories", error))?;
         }
         reach(Failpoint::AttemptsRemoval, Step::After);
         Ok(())

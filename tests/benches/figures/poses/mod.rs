@@ -6,7 +6,7 @@
 
 mod bare;
 pub(crate) mod readers;
-mod stream;
+pub(crate) mod stream;
 
 use std::io::{BufRead as _, BufReader};
 use std::net::SocketAddr;

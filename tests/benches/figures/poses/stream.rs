@@ -20,7 +20,7 @@ use tokio_rustls::TlsConnector;
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::client::Grpc;
 use tonic::codec::{Codec, DecodeBuf, Decoder, EncodeBuf, Encoder};
-use tonic::transport::Endpoint;
+use tonic::transport::{Channel, Endpoint};
 use tonic::{Request, Status, Streaming};
 
 #[derive(Debug, Default)]
@@ -79,6 +79,23 @@ pub(crate) fn admin(pki: &Path) -> Arc<ClientConfig> {
     Arc::new(config)
 }
 
+/// A connection of its own to the controller.
+pub(crate) async fn dial(
+    address: SocketAddr,
+    tls: Arc<ClientConfig>,
+) -> Result<Channel, tonic::transport::Error> {
+    let connect = tower::service_fn(move |_: Uri| {
+        let connector = TlsConnector::from(Arc::clone(&tls));
+        async move {
+            let stream = TcpStream::connect(address).await?;
+            stream.set_nodelay(true)?;
+            let name = ServerName::IpAddress(address.ip().into());
+            connector.connect(name, stream).await.map(TokioIo::new)
+        }
+    });
+    Endpoint::from_shared(format!("http://{address}"))?.connect_with_connector(connect).await
+}
+
 /// One publisher.
 pub(crate) struct Stream {
     batches: mpsc::Sender<Bytes>,
@@ -87,17 +104,7 @@ pub(crate) struct Stream {
 
 impl Stream {
     pub(crate) async fn open(address: SocketAddr, tls: Arc<ClientConfig>) -> Self {
-        let dial = tower::service_fn(move |_: Uri| {
-            let connector = TlsConnector::from(Arc::clone(&tls));
-            async move {
-                let stream = TcpStream::connect(address).await?;
-                stream.set_nodelay(true)?;
-                let name = ServerName::IpAddress(address.ip().into());
-                connector.connect(name, stream).await.map(TokioIo::new)
-            }
-        });
-        let endpoint = Endpoint::from_shared(format!("http://{address}")).expect("an address");
-        let channel = endpoint.connect_with_connector(dial).await.expect("a connection");
+        let channel = dial(address, tls).await.expect("a connection");
         let (batches, queue) = mpsc::channel(4);
         let mut client = Grpc::new(channel);
         client.ready().await.expect("a connection");
