@@ -90,7 +90,7 @@ pub enum AppError {
     #[error(transparent)]
     Open(#[from] OpenError),
     /// The first write failed.
-    #[error("cannot create the default namespace")]
+    #[error("cannot write the default namespace, and of which nodes nothing has been heard so far")]
     Bootstrap(#[source] StoreError),
     /// The metrics recorder.
     #[error("cannot install the metrics recorder")]
@@ -158,7 +158,7 @@ pub async fn start(config: Config) -> Result<Running, AppError> {
     let stop_writer = CancellationToken::new();
     let writer = writer.run(stop_writer.clone());
     let writer = tokio::spawn(guard(Arc::clone(&context), "writer", writer));
-    rest::namespace::bootstrap(&context).await.map_err(AppError::Bootstrap)?;
+    prepare(&context).await.map_err(AppError::Bootstrap)?;
     let admin = context.pki.admin(now)?;
     write_kubeconfig(&context, &admin)?;
 
@@ -178,6 +178,15 @@ pub async fn start(config: Config) -> Result<Running, AppError> {
     let (kill, connections) = (server.kill.clone(), server.connections.clone());
     let accept = tokio::spawn(server.accept(listener));
     Ok(Running { context, kill, connections, background, accept, writer, stop_writer, _lock: lock })
+}
+
+/// Writes what has to be written before anybody is answered. Once for a context.
+///
+/// # Errors
+/// When the store fails.
+pub async fn prepare(context: &Context) -> Result<(), StoreError> {
+    rest::namespace::bootstrap(context).await?;
+    reconcile::health::doubt(context).await
 }
 
 /// Begins everything that works beside the requests: all of a controller but its port. Each part ends when `context.stop`

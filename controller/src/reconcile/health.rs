@@ -4,14 +4,15 @@
 //! Ready condition becomes Unknown and its tasks' phase Unknown. Reservations and leases stay: what
 //! runs there may still run. A node comes back through its session (see [`crate::session`]).
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::Duration;
 
 use futures::future::join_all;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::{MicroTime, Time};
 use muster_api::condition::{self, Condition, ConditionStatus, set_condition};
-use muster_api::kind::node::Node;
+use muster_api::kind::application::Application;
+use muster_api::kind::node::{Node, NodeStatus};
 use muster_api::kind::task::Task;
 use muster_api::name::NodeName;
 use muster_api::phase::TaskPhase;
@@ -20,7 +21,7 @@ use tokio::time::Instant;
 
 use super::RETRY;
 use crate::context::Context;
-use crate::objects::{self, NODES};
+use crate::objects::{self, APPLICATIONS, NODES};
 use crate::session::Sessions;
 use crate::store::StoreError;
 
@@ -33,8 +34,8 @@ const MARK_FOR: Duration = Duration::from_secs(10);
 
 /// Works until dropped.
 pub async fn run(context: Arc<Context>, sessions: Arc<Sessions>) {
-    presume(&context, &sessions);
     let mut marked = Marked::default();
+    marked.mark(&context, &sessions, presume(&context, &sessions)).await;
     loop {
         let deadline = sessions.next_silence();
         tokio::select! {
@@ -50,11 +51,7 @@ pub async fn run(context: Arc<Context>, sessions: Arc<Sessions>) {
         if deadline.is_some_and(|deadline| deadline.elapsed() > HEARTBEAT_EVERY / 2) {
             tokio::time::sleep(HEARTBEAT_EVERY).await;
         }
-        let lost = sessions.silent_nodes();
-        let nodes: Vec<NodeName> = lost.iter().map(|(node, _)| node.clone()).collect();
-        join_all(lost.into_iter().map(|(node, silence)| mark(&context, &sessions, node, silence)))
-            .await;
-        marked.add(nodes);
+        marked.mark(&context, &sessions, sessions.silent_nodes()).await;
     }
 }
 
@@ -71,7 +68,15 @@ async fn until(deadline: Option<Instant>) {
 struct Marked(BTreeMap<NodeName, Instant>);
 
 impl Marked {
-    fn add(&mut self, nodes: Vec<NodeName>) {
+    async fn mark(
+        &mut self,
+        context: &Context,
+        sessions: &Sessions,
+        lost: Vec<(NodeName, Duration)>,
+    ) {
+        let nodes: Vec<NodeName> = lost.iter().map(|(node, _)| node.clone()).collect();
+        join_all(lost.into_iter().map(|(node, silence)| mark(context, sessions, node, silence)))
+            .await;
         let until = Instant::now() + MARK_FOR;
         self.0.extend(nodes.into_iter().map(|node| (node, until)));
     }
@@ -92,15 +97,69 @@ impl Marked {
     }
 }
 
-/// Nodes that were ready before a restart count as heard a little after now.
-fn presume(context: &Context, sessions: &Sessions) {
+/// Writes of robots with parts away that no controller has heard them since this one began; before anybody can be told
+/// anything. What is away is ended by what is known of its robot's silence, and that outlasts however many starts.
+///
+/// # Errors
+/// When the store fails.
+pub async fn doubt(context: &Context) -> Result<(), StoreError> {
+    for home in homes_of_what_is_away(context) {
+        let key = objects::node_key(&home);
+        objects::change(&context.store, &key, |stored, mut node: Node| {
+            let now = context.clock.now();
+            let status = node.status.as_mut().filter(|status| was_heard(status))?;
+            if status.unheard_since.is_some() {
+                return None;
+            }
+            status.unheard_since = Some(MicroTime(now));
+            Some(vec![objects::replace(stored, &node)])
+        })
+        .await?;
+    }
+    Ok(())
+}
+
+fn homes_of_what_is_away(context: &Context) -> BTreeSet<String> {
+    let all = context.store.list(APPLICATIONS, None).items;
+    let all = all.iter().filter_map(|stored| objects::read::<Application>(stored));
+    all.filter(is_away).map(|application| application.spec.home).collect()
+}
+
+fn is_away(application: &Application) -> bool {
+    let parts = application.status.iter().flat_map(|status| &status.parts);
+    parts.flat_map(|part| part.tasks()).any(|task| task.scale != application.spec.home)
+}
+
+/// As far as it is written down, its agent was there.
+fn was_heard(status: &NodeStatus) -> bool {
+    let ready = status.condition(condition::READY);
+    ready.is_some_and(|ready| ready.status != ConditionStatus::Unknown)
+}
+
+/// Nodes that were there before a restart count as heard a little after now. Gives those that do not, as they did so at an
+/// earlier start and have not been heard since, with their silence.
+fn presume(context: &Context, sessions: &Sessions) -> Vec<(NodeName, Duration)> {
+    let now = context.clock.now();
+    let mut silent = Vec::new();
     for stored in context.store.list(NODES, None).items {
         let Some(node) = objects::read::<Node>(&stored) else { continue };
-        let ready = node.status.as_ref().is_some_and(muster_api::kind::node::NodeStatus::is_ready);
-        if let (true, Ok(name)) = (ready, NodeName::new(&*stored.key.name)) {
-            sessions.presume_heard(&name, RESTART_GRACE);
+        let (Some(status), Ok(name)) = (&node.status, NodeName::new(&*stored.key.name)) else {
+            continue;
+        };
+        if !was_heard(status) {
+            continue;
+        }
+        // A date that was set back tells nothing.
+        let unheard = status.unheard_since.as_ref();
+        let unheard = unheard.map(|since| Duration::try_from(now.duration_since(since.0)));
+        match unheard.unwrap_or(Ok(Duration::ZERO)) {
+            Ok(silence) if silence < RESTART_GRACE => {
+                sessions.presume_heard(&name, RESTART_GRACE - silence);
+            }
+            silence => silent.push((name, silence.unwrap_or_default())),
         }
     }
+    silent
 }
 
 async fn mark(context: &Context, sessions: &Sessions, node: NodeName, silence: Duration) {
@@ -186,3 +245,83 @@ async fn mark_tasks(
 
 /// How long without a heartbeat until a node counts as silent.
 pub use muster_controller_core::node_health::DETECT_AFTER;
+
+#[cfg(test)]
+mod tests {
+    use jiff::Timestamp;
+    use muster_api::kind::application::{ApplicationSpec, ApplicationStatus};
+    use muster_api::kind::application::{AttemptStatus, PartStatus};
+    use muster_api::kind::node::{NodeKind, NodeSpec};
+
+    use super::*;
+    use crate::store::{Key, memory};
+
+    async fn node(context: &Context, name: &str, status: ConditionStatus) {
+        let mut node = Node::new(name, NodeSpec::new(NodeKind::Robot));
+        objects::stamp_new(&mut node.metadata, context.clock.now());
+        let ready = Condition::new(condition::READY, status, "Said", String::new());
+        node.status.get_or_insert_default().conditions.push(ready);
+        let create = objects::create(objects::node_key(name), &node);
+        context.store.apply_one(create).await.expect("it is new");
+    }
+
+    async fn application(context: &Context, home: &str, scale: &str) {
+        let name = format!("of-{home}");
+        let spec = serde_json::json!({"home": home, "parts": []});
+        let spec: ApplicationSpec = serde_json::from_value(spec).expect("a spec");
+        let mut application = Application::new(&name, spec);
+        objects::stamp_new(&mut application.metadata, context.clock.now());
+        let task = AttemptStatus { scale: scale.to_owned(), ..AttemptStatus::default() };
+        let part = PartStatus { task: Some(task), ..PartStatus::default() };
+        application.status = Some(ApplicationStatus { parts: vec![part], ..Default::default() });
+        let key = Key::namespaced(APPLICATIONS, "default", &*name);
+        let create = objects::create(key, &application);
+        context.store.apply_one(create).await.expect("it is new");
+    }
+
+    fn unheard(context: &Context, name: &str) -> Option<Timestamp> {
+        let stored = context.store.get(&objects::node_key(name)).expect("it is there");
+        let node: Node = objects::read(&stored).expect("it is a Node");
+        node.status.and_then(|status| status.unheard_since).map(|since| since.0)
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn a_robot_with_parts_away_is_given_up_a_fixed_time_after_the_first_of_many_starts() {
+        let dir = tempfile::tempdir().expect("a directory");
+        let context = crate::context::for_tests(dir.path(), memory::start().await);
+        for (name, ready, scale) in [
+            ("away", ConditionStatus::True, "server"),
+            ("stray", ConditionStatus::False, "server"),
+            ("home", ConditionStatus::True, "home"),
+            ("lost", ConditionStatus::Unknown, "server"),
+        ] {
+            node(&context, name, ready).await;
+            application(&context, name, scale).await;
+        }
+        doubt(&context).await.expect("it is written");
+        let first = ["away", "stray", "home", "lost"].map(|name| unheard(&context, name));
+        assert_eq!(first.map(|since| since.is_some()), [true, true, false, false]);
+        let sessions = Sessions::default();
+        assert_eq!(presume(&context, &sessions), []);
+        let heard = ["away", "stray", "home", "lost"]
+            .map(|name| sessions.is_heard(&NodeName::new(name).expect("a name")));
+        assert_eq!(heard, [true, true, true, false]);
+
+        // It is killed, and started so late that the robot should have been heard meanwhile.
+        let key = objects::node_key("away");
+        let long_ago = context.clock.now() - RESTART_GRACE;
+        objects::change(&context.store, &key, |stored, mut node: Node| {
+            node.status.as_mut()?.unheard_since = Some(MicroTime(long_ago));
+            Some(vec![objects::replace(stored, &node)])
+        })
+        .await
+        .expect("it is written");
+        doubt(&context).await.expect("nothing is to be written");
+        let kept = unheard(&context, "away").expect("it is doubted still");
+        assert_eq!(kept.as_microsecond(), long_ago.as_microsecond(), "the first start counts");
+        let silent = presume(&context, &Sessions::default());
+        let names: Vec<&str> = silent.iter().map(|(name, _)| name.as_str()).collect();
+        assert_eq!(names, ["away"]);
+        assert!(silent[0].1 >= RESTART_GRACE);
+    }
+}

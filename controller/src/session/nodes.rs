@@ -20,6 +20,9 @@ use crate::reconcile::images;
 use crate::rest::enrol;
 use crate::store::{Op, StoreError, Stored};
 
+/// Reason of Ready=False: what should not run there does.
+pub(crate) const STRAY_TASKS: &str = "StrayTasks";
+
 /// What a session says of its agent.
 #[derive(Debug, Clone)]
 pub(crate) struct Speaker {
@@ -169,6 +172,7 @@ fn fill(context: &Context, speaker: &Speaker, report: &NodeReport, node: &mut No
 
 /// What the controller says of a node whose agent is connected and runs `strays`.
 fn judge(status: &mut NodeStatus, strays: &[String], now: jiff::Timestamp) {
+    status.unheard_since = None;
     let fenced = status.condition(condition::FENCED);
     let fenced = fenced.is_some_and(|c| c.status == ConditionStatus::True);
     let conditions = &mut status.conditions;
@@ -187,7 +191,7 @@ fn judge(status: &mut NodeStatus, strays: &[String], now: jiff::Timestamp) {
         let message = format!(
             "its agent runs what it should not, and is told to stop it: {names}; nothing new begins there until that has ended"
         );
-        set(condition::READY, false, "StrayTasks", message)
+        set(condition::READY, false, STRAY_TASKS, message)
     };
     if news {
         status.last_seen = Some(MicroTime(now));

@@ -190,6 +190,10 @@ pub struct NodeStatus {
     /// When the agent was last heard, as far as it is written down.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub last_seen: Option<MicroTime>,
+    /// Of the home of parts that are away: when a controller started that has not heard it so far. How long the agent has
+    /// been silent before that is not known. None: the controller that heard it last has not ended since.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub unheard_since: Option<MicroTime>,
     /// The life of the agent that reported all this.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub incarnation: Option<Incarnation>,

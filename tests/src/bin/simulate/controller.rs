@@ -361,7 +361,7 @@ async fn boot(house: &House, wall: Wall) -> Result<Port, String> {
     let mut context = Context::new(store, pki, config(dir, address), address, metrics, events);
     context.audit = Audit::at_once(dir.join("audit"));
     let context = Arc::new(context.with_clock(Arc::new(wall)));
-    rest::namespace::bootstrap(&context).await.map_err(|error| app::chain(&error))?;
+    app::prepare(&context).await.map_err(|error| app::chain(&error))?;
     for member in members {
         join(&context, member).await?;
     }

@@ -21,6 +21,8 @@ pub struct Scales {
     pub views: Vec<ScaleView>,
     /// How many of them the spec names, home included; on the others is only what is left there.
     pub named: usize,
+    /// Nobody knows for how long home has been silent (see [`NodeSeen::unheard`]).
+    pub home_unheard: bool,
 }
 
 impl Scales {
@@ -40,7 +42,8 @@ impl Scales {
         for view in &mut views[named..] {
             view.unfit.get_or_insert_with(|| "it is none of the application's scales".to_owned());
         }
-        Scales { views, named }
+        let home_unheard = snapshot.nodes.get(&spec.home).is_some_and(|home| home.unheard);
+        Scales { views, named, home_unheard }
     }
 
     /// The index of a node.

@@ -9,6 +9,12 @@
 //! What is away ends by the controller's word when the robot is silent, and by its own node's when that is cut off as well
 //! (`onDisconnect: Stop`). Each counts from its last contact by its own clock; heartbeats that one side knows of and the
 //! other does not are what [`SLACK`] is for. A part with actuators never comes here: it is critical.
+//!
+//! A controller that is killed and started again does not know when the robot was heard last. Until it hears it, that is
+//! written into the Node ([`NodeSeen::unheard`]), and lasts however often it is killed: the robot is given up for silent a
+//! fixed time after the first of these starts, and what is away is ended as soon as it is.
+//!
+//! [`NodeSeen::unheard`]: super::view::NodeSeen::unheard
 
 use std::time::Duration;
 
@@ -131,7 +137,8 @@ impl Runner {
         for away in [Some(stage.serves()), stage.other()].into_iter().flatten() {
             let stop = self.task(look, away).and_then(|task| task.view.stop_after);
             let Some(stop) = stop.filter(|_| away.scale != HOME) else { continue };
-            let due = after(home.since, stop);
+            // Who does not know how long it has been silent takes it for long enough.
+            let due = if look.scales.home_unheard { look.now } else { after(home.since, stop) };
             if due > look.now {
                 out.look_at(due);
             } else if !self.is_gone(look, away) {

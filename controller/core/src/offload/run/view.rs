@@ -40,6 +40,8 @@ pub struct NodeSeen {
     pub allocatable: (f64, f64),
     /// What its link is known to do.
     pub link: LinkSeen,
+    /// No controller has heard it since one was started: nobody knows for how long it has been silent.
+    pub unheard: bool,
 }
 
 /// What is known of the link between a node and the network.
@@ -89,6 +91,7 @@ impl NodeSeen {
             free: amount(&status.free),
             allocatable: amount(&status.allocatable),
             link: LinkSeen { bandwidth: declared.map(|rate| rate.0 as f64), ..LinkSeen::default() },
+            unheard: status.unheard_since.is_some(),
         }
     }
 }

@@ -243,6 +243,17 @@ fn what_is_away_ends_before_its_robot_cut_off_begins_the_part_by_itself() {
 }
 
 #[test]
+fn what_is_away_ends_at_once_when_nobody_knows_for_how_long_its_robot_has_been_silent() {
+    let mut world = settled();
+    world.nodes.get_mut("robot").expect("a node").unheard = true;
+    world.run(1.0);
+    assert_eq!(world.live("amcl"), ["app-amcl-2"], "it counts as there so far");
+    world.hear("robot", false);
+    world.run(3.5);
+    assert_eq!(world.live("amcl"), [""; 0]);
+}
+
+#[test]
 fn what_stands_by_waits_long_enough_for_what_is_away_whatever_became_of_the_spec() {
     let mut world = settled();
     let begins = |world: &World| {
