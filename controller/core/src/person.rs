@@ -27,7 +27,8 @@ pub struct Robot {
     pub unfenced: Option<String>,
     /// Its agent is there.
     pub is_heard: bool,
-    /// Tasks that have not ended there were granted it: whoever holds it now, they may have its drivers still.
+    /// Tasks that have not ended there were granted it, or what was called off there lives: whoever holds it now, they may
+    /// have its drivers still.
     pub is_driven: bool,
 }
 

@@ -14,10 +14,10 @@ use std::time::Duration;
 
 use http::StatusCode;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::MicroTime;
-use muster_api::condition::{ACTUATORS_FENCED, ConditionStatus};
+use muster_api::condition::{ACTUATORS_FENCED, ConditionStatus, READY};
 use muster_api::id::Epoch;
 use muster_api::kind::lease::{DEFAULT_GROUP, HolderKind, Lease, LeaseHolder, LeaseSpec};
-use muster_api::kind::node::Node;
+use muster_api::kind::node::{Node, NodeStatus};
 use muster_api::kind::task::Task;
 use muster_api::name::NodeName;
 use muster_controller_core::person::{self, Outcome, Robot, Step};
@@ -29,6 +29,7 @@ use super::{Answer, Call, body, failure::Failure};
 use crate::audit::Named;
 use crate::context::{Context, Live};
 use crate::objects::{self, NODES, TASKS};
+use crate::session::nodes::STRAY_TASKS;
 use crate::store::{Key, Op, Precondition, Stored};
 
 /// The order goes out at once; a robot on a bad link is given this long to say that its gate counts it.
@@ -160,7 +161,13 @@ fn robot(context: &Context, live: &Live, lease: &Lease) -> Robot {
         None => Some("no gate stands before its drivers".to_owned()),
     };
     let is_heard = NodeName::new(name).is_ok_and(|name| live.sessions.is_heard(&name));
-    Robot { unfenced, is_heard, is_driven: is_driven(context, lease) }
+    let is_driven = is_driven(context, lease) || status.as_ref().is_some_and(runs_strays);
+    Robot { unfenced, is_heard, is_driven }
+}
+
+/// What was called off there lives, and nobody knows any more what it was granted.
+fn runs_strays(status: &NodeStatus) -> bool {
+    status.condition(READY).is_some_and(|ready| ready.reason == STRAY_TASKS)
 }
 
 /// Whether a task that has not ended on its node was granted the lease once, held or taken since.

@@ -70,7 +70,7 @@ impl Session {
         let names = self.stray_names().join(", ");
         tracing::warn!(node = %self.node, strays = names, "the agent runs what it should not; it is told to stop it");
         let message = format!("its agent runs what it should not, and is told to stop it: {names}");
-        self.context.events.warn_node(self.node.as_str(), "StrayTasks", message);
+        self.context.events.warn_node(self.node.as_str(), nodes::STRAY_TASKS, message);
     }
 
     /// After the strays changed: the node says so, and the agent gets the page that goes with it.

@@ -79,6 +79,9 @@ async fn a_fence_ends_what_was_there_and_a_stray_keeps_the_node_until_it_ended()
     assert_eq!(condition(&node, "Fenced").0, "True");
     let waits = |task: &Value| task["status"]["why"].to_string().contains("default/first");
     cluster.until(&format!("{TASKS}/second"), waits).await;
+    let take = format!("{G}/leases/r1.body/take");
+    let refused = send(&admin, "POST", &take, json!({"reason": "to look"})).await;
+    assert_eq!(refusal(&refused), (409, "NotFenced"), "what drives there would drive on");
 
     session.say(report(&first, 10, Failed)).await;
     let given = session.assigned(&second).await;

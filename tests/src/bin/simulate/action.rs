@@ -281,7 +281,7 @@ impl World {
             Action::Fence => {
                 let name = self.agents[index].name().to_owned();
                 let tasks = self.may_end_on(index);
-                self.truth.written_off.extend(tasks.iter().cloned());
+                self.truth.write_off(&tasks);
                 self.ask(|users, _| Some(users.fence(&name, tasks)))
             }
             Action::Take | Action::Acquire | Action::Return => self.hold(action, index),

@@ -188,7 +188,7 @@ impl Applications {
             let status = application.status.clone().unwrap_or_default();
             for part in &status.parts {
                 let live: Vec<usize> = members(view, uid, &part.name)
-                    .filter(|(uid, _)| !truth.written_off.contains(*uid))
+                    .filter(|(uid, _)| !truth.is_written_off(uid))
                     .filter_map(|(uid, _)| truth.live.get(uid).map(|live| live.node))
                     .collect();
                 let settled = matches!(part.stage, None | Some(MoveStage::Settled));

@@ -118,7 +118,7 @@ impl World {
             }
             // Who was told that a node is not off has called off none of its tasks.
             Some(Asked::Fence(tasks)) if (400..500).contains(&code) => {
-                self.truth.written_off.retain(|uid| !tasks.contains(uid));
+                self.truth.take_back(&tasks);
             }
             _ => {}
         }

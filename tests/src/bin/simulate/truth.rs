@@ -1,7 +1,7 @@
 //! What really runs: the kernels of all machines together, as no part of muster sees them. The invariants are held against
 //! this, at every start of a process.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 
 use muster_agent_core::gate::{Relation, Token};
 use muster_agent_core::observed::Exit;
@@ -95,7 +95,7 @@ pub(crate) struct Truth {
     /// The newest grant of each robot that a person was told is theirs.
     persons: BTreeMap<usize, u64>,
     /// Tasks of nodes that a person called off: he may have erred, and what they do is his.
-    pub(crate) written_off: BTreeSet<TaskUid>,
+    written_off: BTreeMap<TaskUid, u32>,
     pub(crate) beside: Vec<Beside>,
     /// Every task that ever began; no name is used twice.
     pub(crate) names: BTreeMap<String, TaskUid>,
@@ -173,14 +173,29 @@ impl Truth {
     ) -> Result<(), Violation> {
         let Some(part) = part_of(&program.name) else { return Ok(()) };
         let mut others = self.parts.iter().filter(|(other, of)| *of == part && *other != uid);
-        let lives =
-            |other: &TaskUid| self.live.contains_key(other) && !self.written_off.contains(other);
+        let lives = |other: &TaskUid| self.live.contains_key(other) && !self.is_written_off(other);
         if let Some((other, _)) = others.find(|(other, _)| program.standby && lives(other)) {
             let how = format!("{} ({uid}) begins by itself, and {other} lives", program.name);
             return Err(Invariant::NothingRunsTwice.broken(how));
         }
         self.parts.insert(uid.clone(), part.to_owned());
         Ok(())
+    }
+
+    /// Somebody says that these are gone.
+    pub(crate) fn write_off(&mut self, tasks: &[TaskUid]) {
+        tasks.iter().for_each(|uid| *self.written_off.entry(uid.clone()).or_default() += 1);
+    }
+
+    /// He was told that they are not; what others were believed before stays.
+    pub(crate) fn take_back(&mut self, tasks: &[TaskUid]) {
+        for uid in tasks {
+            self.written_off.entry(uid.clone()).and_modify(|times| *times -= 1);
+        }
+    }
+
+    pub(crate) fn is_written_off(&self, uid: &TaskUid) -> bool {
+        self.written_off.get(uid).is_some_and(|times| *times > 0)
     }
 
     /// Who has the actuators is alone with them, but for those from whom a person took them.
@@ -208,7 +223,7 @@ impl Truth {
 
     fn is_no_persons(&self, node: usize, uid: &TaskUid, epoch: u64) -> Result<(), Violation> {
         let person = self.persons.get(&node).copied().unwrap_or(0);
-        if epoch >= person || self.written_off.contains(uid) {
+        if epoch >= person || self.is_written_off(uid) {
             return Ok(());
         }
         let how = format!(
