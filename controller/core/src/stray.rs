@@ -36,6 +36,15 @@ impl Strays {
         self.live.contains(uid) && self.strays.insert(uid.clone())
     }
 
+    /// Takes in all that the store gives to this node: what lives beside that is a stray. True: the strays are others than
+    /// before.
+    #[must_use = "a change of the strays must be written to the node"]
+    pub fn given(&mut self, is_given: impl Fn(&TaskUid) -> bool) -> bool {
+        let before = self.strays.len();
+        self.strays.extend(self.live.iter().filter(|uid| !is_given(uid)).cloned());
+        self.strays.len() > before
+    }
+
     /// The agent says that the task lives.
     #[must_use]
     pub fn lives(&self, uid: &TaskUid) -> bool {
@@ -71,6 +80,10 @@ mod tests {
         assert!(strays.withdrawn(&good) && !strays.withdrawn(&good));
         assert!(!strays.withdrawn(&uid("unheard")), "nothing of it lives here");
         assert!(strays.told(&bad, false, false) && !strays.is_empty());
+        let more = uid("more");
+        assert!(!strays.told(&more, true, true) && !strays.given(|uid| *uid == more));
+        assert!(strays.given(|_| false) && strays.iter().any(|uid| *uid == more));
+        assert!(!strays.given(|_| false) && strays.told(&more, false, false));
         assert!(strays.told(&good, false, false) && strays.is_empty());
         assert!(!strays.lives(&good) && !strays.told(&good, false, false));
     }

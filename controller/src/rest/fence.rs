@@ -114,7 +114,11 @@ async fn carry_out(
                 return Ok((written.into_iter().next().filter(|_| marked), ended));
             }
             Err(error) if objects::is_race(&error) => tokio::task::yield_now().await,
-            Err(error) => return Err(refused(target, name, &error)),
+            Err(error) => {
+                // It may be there all the same.
+                sessions.kick(word.node);
+                return Err(refused(target, name, &error));
+            }
         }
     }
 }

@@ -5,6 +5,7 @@
 //! While there is a stray the node is not ready, and the agent is sent no task that it does not know
 //! already. When the last stray has ended, the whole page is sent again.
 
+use std::collections::BTreeSet;
 use std::sync::Arc;
 
 use muster_api::id::TaskUid;
@@ -20,8 +21,18 @@ use crate::objects;
 impl Session {
     /// Sends everything that the node should have; gives what wakes this session when that changes.
     /// Of `told`, what has ended and nobody asks for any more is released.
-    pub(super) async fn send_page(&self, told: &[wire::TaskReport]) -> Result<Arc<Notify>, End> {
+    pub(super) async fn send_page(
+        &mut self,
+        told: &[wire::TaskReport],
+    ) -> Result<Arc<Notify>, End> {
         let (mut page, wake) = self.sessions.board().whole_page(&self.node);
+        // A fence that seemed to fail may be found to be there while Hello is written.
+        let given: BTreeSet<&str> =
+            page.upserts.iter().filter(|a| !a.ended).map(|a| a.uid.as_str()).collect();
+        if self.strays.given(|uid| given.contains(uid.as_str())) {
+            self.tell_strays();
+            self.write_strays().await?;
+        }
         let named = |uid: &str| page.upserts.iter().any(|a| a.uid == uid);
         let over = told.iter().filter(|report| !lives(report) && !named(&report.uid));
         page.released = over.map(|report| report.uid.clone()).collect();
@@ -79,13 +90,16 @@ impl Session {
         if appeared {
             self.tell_strays();
         }
-        nodes::write_strays(&self.context, &self.node, &self.stray_names())
-            .await
-            .map_err(internal)?;
+        self.write_strays().await?;
         if appeared || self.strays.is_empty() {
             self.send_page(&[]).await?;
         }
         Ok(())
+    }
+
+    async fn write_strays(&self) -> Result<(), End> {
+        let names = self.stray_names();
+        nodes::write_strays(&self.context, &self.node, &names).await.map_err(internal)
     }
 
     /// Sends what changed of the page, unless it makes a stray of something that lives.
