@@ -14,6 +14,8 @@
 mod failed;
 mod probed;
 #[cfg(test)]
+mod recovered;
+#[cfg(test)]
 mod standby;
 mod waited;
 
@@ -346,8 +348,12 @@ impl Workload {
         match self.state {
             State::Waiting { .. } => self.move_on(context, effects),
             State::Stopping { again, .. } if due(again) => self.stop(context, effects),
-            State::Recovering { again, .. } if due(again) => {
-                effects.push(Effect::Find(self.attempt));
+            State::Recovering { began, rebooted, again, refused } if due(again) => {
+                // Once: what is found out by a question that is still under way would void the launch that the first answer
+                // brings about.
+                let again = context.now.boot.plus(STOP_AGAIN_MS);
+                self.state = State::Recovering { began, rebooted, again, refused };
+                effects.extend([Effect::WakeAt(again), Effect::Find(self.attempt)]);
             }
             State::Removing { again, .. } if due(again) => effects.push(Effect::Remove),
             _ => {}
