@@ -1,11 +1,13 @@
 //! Applications with real processes on a robot and a cloud server: their parts run, move to where they are worth more, and
 //! come home when they must.
 
+use std::time::Duration;
+
 use kube::Api;
 use kube::api::PostParams;
 use muster_api::kind::application::{
-    APPLICATION_LABEL, Application, ApplicationPhase, ApplicationStatus, MoveStage, PART_LABEL,
-    PartStatus,
+    APPLICATION_LABEL, Application, ApplicationPhase, ApplicationStatus, CutOff, MoveStage,
+    PART_LABEL, PartStatus,
 };
 use muster_api::quantity::MilliCpu;
 use muster_tests::{AgentOptions, Cluster, kernel, wait};
@@ -211,8 +213,19 @@ async fn a_topic_that_comes_too_slowly_to_a_part_that_is_away_brings_it_home() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_robot_that_is_cut_off_begins_by_itself_what_is_away_when_nothing_of_it_runs_there() {
+    cut_off(CutOff::Fenced).await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_robot_that_is_cut_off_begins_in_time_what_is_away() {
+    cut_off(CutOff::InTime).await;
+}
+
+async fn cut_off(when: CutOff) {
     let mut cluster = robot_and_cloud().await;
-    create(&cluster, corridor("exec sleep 1000")).await;
+    let mut spec = corridor("exec sleep 1000");
+    spec["parts"][1]["whenCutOff"] = json!(when);
+    create(&cluster, spec).await;
     let there = processes(&serves_on(&cluster, "cloud").await);
     let stands_by = |status: &ApplicationStatus| {
         let standby = status.part("ar").and_then(|ar| ar.standby.clone());
@@ -222,6 +235,9 @@ async fn a_robot_that_is_cut_off_begins_by_itself_what_is_away_when_nothing_of_i
     let standby = stands_by(&standby).expect("it was waited for");
     let task = cluster.task(&standby.name, "standing by", |s| s.reason == "Standby").await;
     assert_eq!(task.status.and_then(|s| s.node).as_deref(), Some("robot"));
+    let begins = task.spec.standby.map(|standby| standby.after.as_duration());
+    let begins = begins.expect("it stands by");
+    assert_eq!(begins < Duration::from_secs(6), when == CutOff::InTime, "{begins:?}");
     // A node's books are written a moment after what is in them.
     wait::object(cluster.nodes().await, "robot", "keeping what it needs", |node| {
         let status = node.and_then(|node| node.status.as_ref());
@@ -235,7 +251,7 @@ async fn a_robot_that_is_cut_off_begins_by_itself_what_is_away_when_nothing_of_i
     let begun = wait::until("begun by the robot", || async {
         let begun = kernel::with_env("MUSTER_UID", &standby.uid);
         let gone = are_gone(&there);
-        assert!(begun.is_empty() || gone, "both run");
+        assert!(begun.is_empty() || gone || when == CutOff::InTime, "both run");
         if begun.is_empty() { Err(format!("gone there: {gone}")) } else { Ok(begun) }
     })
     .await;

@@ -134,6 +134,9 @@ pub struct Part {
     /// the weight `objective.accuracy`.
     #[serde(default = "one", skip_serializing_if = "is_one")]
     pub home_accuracy: f64,
+    /// What its robot does when it is cut off while the part is away.
+    #[serde(default, skip_serializing_if = "CutOff::is_default")]
+    pub when_cut_off: CutOff,
     /// The task that it is. Sensors and actuators keep the part at home.
     pub template: PartTemplate,
 }
@@ -157,6 +160,27 @@ pub enum Runs {
     Sometimes,
     /// It gives its data once and is done: a map server. It stays at home, and its connections have no frequency.
     Once,
+}
+
+/// What a robot does that is cut off while a part of it is away. Of a part none of whose connections has a `minHz` nothing is
+/// urgent: it is always `Fenced`.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+pub enum CutOff {
+    /// It begins the part before the tolerance of its connections is over, and not before it has been without contact for
+    /// 5 s: a controller that is started again disturbs nobody. For some seconds what is away may run beside it, where the
+    /// robot cannot see it: until the controller has noticed, or its own node.
+    #[default]
+    InTime,
+    /// It begins the part when what is away has surely ended, however little its connections tolerate. For a part that
+    /// writes where others read, and must never do so twice.
+    Fenced,
+}
+
+impl CutOff {
+    #[expect(clippy::trivially_copy_pass_by_ref, reason = "serde passes a reference")]
+    fn is_default(&self) -> bool {
+        *self == CutOff::default()
+    }
 }
 
 /// What a part's task is made of.

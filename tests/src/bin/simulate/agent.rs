@@ -22,6 +22,7 @@ use muster_api::wire::agent::v1 as proto;
 use muster_api::wire::gate::v1 as gate_proto;
 
 use crate::agenda::{Agenda, Due};
+use crate::applications::{GLANCE, LOOK};
 use crate::controller::{EPOCH, Member};
 use crate::dice::Dice;
 use crate::invariant::{Invariant, Violation};
@@ -484,7 +485,8 @@ impl Agent {
         let name = wire.name.clone();
         let process = spec.run.process.as_ref();
         let runs = |what| process.is_some_and(|process| process.command == [what]);
-        let (crashes, tells, standby) = (runs("crash"), runs("look"), spec.standby.is_some());
+        let (crashes, tells) = (runs("crash"), runs(LOOK) || runs(GLANCE));
+        let standby = spec.standby.is_some() && runs(LOOK);
         let program =
             Program { name, takes, grace_ms, stop_after_ms, tells, standby, crashes, waits_for };
         Kept { program }

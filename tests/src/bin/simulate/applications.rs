@@ -10,7 +10,7 @@ use bytes::Bytes;
 use http::Request;
 use muster_api::id::TaskUid;
 use muster_api::kind::application::{
-    Application, ApplicationPhase, MoveStage, PART_LABEL, PartStatus,
+    Application, ApplicationPhase, CutOff, MoveStage, PART_LABEL, PartStatus,
 };
 use muster_api::kind::task::Task;
 use muster_api::phase::TaskPhase;
@@ -25,9 +25,15 @@ use crate::view::{View, controller, phase};
 use crate::world::World;
 
 const APPLICATIONS: &str = "/apis/muster.dev/v1alpha1/namespaces/default/applications";
-/// The part that may move, and the only node it may move to.
-const LOOK: &str = "look";
+/// The part that may move, and the only node it may move to. Its command is this where its robot, cut off, begins it only when
+/// nothing else of it runs.
+pub(crate) const LOOK: &str = "look";
+/// Its command where the robot begins it in time.
+pub(crate) const GLANCE: &str = "glance";
 const SERVER: &str = "c1";
+/// How long it may run twice then, milliseconds: until what is away has surely ended, whatever happens to it, its robot and
+/// the controller.
+const BESIDE: u64 = 20_000;
 /// How long its topic may be too slow, and its signal too high, milliseconds.
 const TOLERANCE: u64 = 4_000;
 /// From a heartbeat to the next one, and until what a robot keeps ready runs.
@@ -68,6 +74,8 @@ struct Wish {
 #[derive(Debug, Default)]
 pub(crate) struct Applications {
     wishes: BTreeMap<String, Wish>,
+    /// Since when the part of an application runs twice.
+    beside: BTreeMap<TaskUid, u64>,
 }
 
 /// The part that a task is, by its name: none of other tasks begins so.
@@ -90,10 +98,12 @@ fn part(name: &str, command: &str, resources: Value, dice: &mut Dice) -> Value {
 fn create(name: &str, dice: &mut Dice) -> Value {
     let home = dice.pick(&["r1", "r2", "r3"]).copied().unwrap_or("r1");
     let tolerance = format!("{TOLERANCE}ms");
+    let (look, when) = if dice.one_in(2) { (LOOK, "Fenced") } else { (GLANCE, "InTime") };
     let mut parts = vec![
         part("camera", "work", json!({"cpu": "100m", "sensors": ["kinect:ImageGen"]}), dice),
-        part(LOOK, "look", json!({"cpu": "200m", "memory": "16Mi"}), dice),
+        part(LOOK, look, json!({"cpu": "200m", "memory": "16Mi"}), dice),
     ];
+    parts[1]["whenCutOff"] = when.into();
     let mut connections = vec![json!({
         "topic": "/image", "from": "camera", "to": LOOK, "minHz": 5.0, "tolerance": tolerance,
     })];
@@ -182,7 +192,7 @@ impl Applications {
     }
 
     /// What must hold of the parts at each look.
-    pub(crate) fn check(&mut self, view: &View, truth: &Truth) -> Result<(), Violation> {
+    pub(crate) fn check(&mut self, view: &View, truth: &Truth, now: u64) -> Result<(), Violation> {
         self.nothing_is_lost(view)?;
         for (key, uid, application) in view.applications.all() {
             let status = application.status.clone().unwrap_or_default();
@@ -191,13 +201,23 @@ impl Applications {
                     .filter(|(uid, _)| !truth.is_written_off(uid))
                     .filter_map(|(uid, _)| truth.live.get(uid).map(|live| live.node))
                     .collect();
+                let home = truth.node_named(&application.spec.home);
+                let twice = live.len() > 1;
+                if part.name == LOOK && !twice {
+                    self.beside.remove(uid);
+                }
+                // Its robot was cut off, and nobody else knows that it has begun it.
+                let alone = part.name == LOOK
+                    && live.len() == 2
+                    && home.is_some_and(|home| live.contains(&home));
+                let alone = alone && begins_in_time(application);
+                let bears = || now - *self.beside.entry(uid.clone()).or_insert(now) < BESIDE;
                 let settled = matches!(part.stage, None | Some(MoveStage::Settled));
-                if live.len() > 1 && settled {
+                if twice && settled && !(alone && bears()) {
                     let (name, count) = (&part.name, live.len());
                     let how = format!("{key}: {name} runs {count} times, and does not move");
                     return Err(Invariant::NothingRunsTwice.broken(how));
                 }
-                let home = truth.node_named(&application.spec.home);
                 if part.name != LOOK && live.iter().any(|node| Some(*node) != home) {
                     let how = format!("{key}: {} is critical, and runs away from home", part.name);
                     return Err(Invariant::WorkOutlivesItsManagers.broken(how));
@@ -206,6 +226,10 @@ impl Applications {
         }
         Ok(())
     }
+}
+
+fn begins_in_time(application: &Application) -> bool {
+    application.spec.part(LOOK).is_some_and(|part| part.when_cut_off == CutOff::InTime)
 }
 
 /// The tasks of a part.

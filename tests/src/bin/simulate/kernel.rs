@@ -22,7 +22,7 @@ pub(crate) struct Program {
     pub(crate) stop_after_ms: Option<u64>,
     /// It tells of a topic and of a signal.
     pub(crate) tells: bool,
-    /// Its node may begin it by itself, without contact.
+    /// Its node may begin it by itself, without contact, when nothing else of the part runs.
     pub(crate) standby: bool,
     /// It ends by itself, soon and badly.
     pub(crate) crashes: bool,

@@ -393,7 +393,7 @@ impl World {
                 self.users.sets.check(&self.view, &self.truth)?;
             }
             if self.cast.applications {
-                self.users.applications.check(&self.view, &self.truth)?;
+                self.users.applications.check(&self.view, &self.truth, self.now)?;
             }
             self.users.nothing_acknowledged_is_lost(&self.view)?;
         }

@@ -1,6 +1,8 @@
 //! What a robot begins by itself when it is cut off: while a part is away, a task of it stands by at home, with its cpu and
 //! memory kept.
 //!
+//! A part that is [`CutOff::Fenced`] never runs twice:
+//!
 //! ```text
 //!   robot cut off ──stop──▶ the controller ends what is away ──grace──▶ gone ──SLACK──▶ the robot begins the standby
 //!                   its server cut off just before that ──stop──▶ the server ends it ──grace──▶ gone ─▲
@@ -10,6 +12,9 @@
 //! (`onDisconnect: Stop`). Each counts from its last contact by its own clock; heartbeats that one side knows of and the
 //! other does not are what [`SLACK`] is for. A part with actuators never comes here: it is critical.
 //!
+//! One that is [`CutOff::InTime`] begins before its connections' tolerance is over, where that is longer than a controller
+//! takes to start again; what is away is told to end at the same moment.
+//!
 //! A controller that is killed and started again does not know when the robot was heard last. Until it hears it, that is
 //! written into the Node ([`NodeSeen::unheard`]), and lasts however often it is killed: the robot is given up for silent a
 //! fixed time after the first of these starts, and what is away is ended as soon as it is.
@@ -18,17 +23,19 @@
 
 use std::time::Duration;
 
-use muster_api::kind::application::stamp;
+use muster_api::kind::application::{CutOff, stamp};
 use muster_api::phase::TaskPhase;
 
 use super::runner::Runner;
+use super::view::TaskSeen;
 use super::{Action, Ending, Gathered, Look, NewTask, News};
 use crate::offload::migration::{Attempt, Event, Stage};
 use crate::offload::problem::HOME;
 use crate::taskset::after;
 use crate::taskset::places::REPLACE_ENDED_AFTER;
 
-/// For so long without contact nothing away is ended: a controller that is started again, or upgraded, is back by then.
+/// For so long without contact nothing away is ended, and nothing is begun at home: a controller that is started again, or
+/// upgraded, is back by then.
 const BEARS: Duration = Duration::from_secs(5);
 /// Between the end of what is away and the beginning of the standby: heartbeats that only one side knows of (until a silence is
 /// noticed, 2 s), a controller that is started again (it counts every node as heard 3 s longer), and clocks.
@@ -44,11 +51,16 @@ pub(super) struct Alone {
 }
 
 impl Alone {
-    /// The standby serves before its connections' tolerance is over, where that is longer than fencing takes.
-    pub(super) fn of(patience: Option<Duration>, grace: Duration) -> Self {
+    /// The standby serves before its connections' tolerance is over; of a part that must not run twice, where that is longer
+    /// than fencing takes.
+    pub(super) fn of(patience: Option<Duration>, grace: Duration, when: CutOff) -> Self {
         let takes = grace + SLACK;
-        let begin = patience.unwrap_or_default().max(BEARS * 2 + takes);
-        Alone { stop: begin.saturating_sub(takes) / 2, begin }
+        let fenced = patience.unwrap_or_default().max(BEARS * 2 + takes);
+        let begin = match (when, patience) {
+            (CutOff::InTime, Some(patience)) => patience.max(BEARS),
+            (CutOff::Fenced, _) | (_, None) => fenced,
+        };
+        Alone { stop: fenced.saturating_sub(takes) / 2, begin }
     }
 }
 
@@ -57,7 +69,7 @@ impl Runner {
         let part = self.spec(look)?;
         let patience = look.model.patience(self.part?);
         let grace = Duration::from_secs(part.template.spec.grace_period_seconds.into());
-        Some(Alone::of(patience, grace))
+        Some(Alone::of(patience, grace, part.when_cut_off))
     }
 
     /// What became of the task that stands by.
@@ -119,24 +131,31 @@ impl Runner {
     }
 
     /// After how long without contact the robot may begin what stands by for a task that is away; none: that does not end
-    /// by itself.
+    /// by itself, which it must at some time in any case.
     fn begins_after(&self, look: &Look<'_>, away: Attempt) -> Option<Duration> {
-        let grace = self.spec(look)?.template.spec.grace_period_seconds;
+        let part = self.spec(look)?;
         let stop = self.task(look, away)?.view.stop_after?;
-        let surely = stop * 2 + Duration::from_secs(grace.into()) + SLACK;
-        Some(self.alone_after(look)?.begin.max(surely))
+        let begin = self.alone_after(look)?.begin;
+        let watched = look.model.patience(self.part?).is_some();
+        if part.when_cut_off == CutOff::InTime && watched {
+            return Some(begin);
+        }
+        let grace = Duration::from_secs(part.template.spec.grace_period_seconds.into());
+        Some(begin.max(stop * 2 + grace + SLACK))
     }
 
     /// Ends what is away of a robot that cannot be reached and has something that stands by.
     fn end_before(&self, look: &Look<'_>, stage: Stage, standby: Attempt, out: &mut Gathered) {
-        let placed = self.task(look, standby).is_some_and(|task| task.view.phase.holds_node());
+        let placed = |task: &&TaskSeen| task.view.phase.holds_node();
         let home = &look.scales.views[HOME].link;
-        if home.up || !placed {
+        let Some(standby) = self.task(look, standby).filter(placed).filter(|_| !home.up) else {
             return;
-        }
+        };
         for away in [Some(stage.serves()), stage.other()].into_iter().flatten() {
             let stop = self.task(look, away).and_then(|task| task.view.stop_after);
             let Some(stop) = stop.filter(|_| away.scale != HOME) else { continue };
+            // By then it runs at home, if the robot lives.
+            let stop = standby.standby.map_or(stop, |begins| begins.min(stop));
             // Who does not know how long it has been silent takes it for long enough.
             let due = if look.scales.home_unheard { look.now } else { after(home.since, stop) };
             if due > look.now {
@@ -186,14 +205,25 @@ mod tests {
     #[test]
     fn what_is_away_has_ended_when_the_robot_begins_it() {
         let seconds = Duration::from_secs;
-        let short = Alone::of(Some(seconds(1)), seconds(2));
+        let fenced = |patience, grace| Alone::of(patience, grace, CutOff::Fenced);
+        let short = fenced(Some(seconds(1)), seconds(2));
         assert_eq!(short, Alone { stop: BEARS, begin: seconds(20) });
-        let long = Alone::of(Some(seconds(65)), seconds(2));
+        let long = fenced(Some(seconds(65)), seconds(2));
         assert_eq!(long, Alone { stop: Duration::from_millis(27_500), begin: seconds(65) });
         for (patience, grace) in [(None, 0), (Some(seconds(7)), 10), (Some(seconds(400)), 3)] {
-            let alone = Alone::of(patience, seconds(grace));
+            let alone = fenced(patience, seconds(grace));
             assert!(alone.stop * 2 + seconds(grace) + SLACK <= alone.begin, "{alone:?}");
             assert!(alone.begin >= patience.unwrap_or_default());
         }
+    }
+
+    #[test]
+    fn a_robot_begins_in_time_unless_its_controller_may_only_be_starting_again() {
+        let (seconds, grace) = (Duration::from_secs, Duration::from_secs(2));
+        let in_time = |patience| Alone::of(patience, grace, CutOff::InTime);
+        assert_eq!(in_time(Some(seconds(7))), Alone { stop: BEARS, begin: seconds(7) });
+        assert_eq!(in_time(Some(Duration::ZERO)), Alone { stop: BEARS, begin: BEARS });
+        assert_eq!(in_time(Some(seconds(65))).begin, seconds(65));
+        assert_eq!(in_time(None), Alone::of(None, grace, CutOff::Fenced), "nothing is urgent");
     }
 }

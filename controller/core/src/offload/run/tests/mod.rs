@@ -1,6 +1,6 @@
 mod world;
 
-use muster_api::kind::application::{ApplicationPhase, MoveStage, PartClass};
+use muster_api::kind::application::{ApplicationPhase, CutOff, MoveStage, PartClass};
 use muster_api::kind::node::MissionLock;
 use muster_api::phase::TaskPhase;
 
@@ -254,6 +254,37 @@ fn what_is_away_ends_at_once_when_nobody_knows_for_how_long_its_robot_has_been_s
 }
 
 #[test]
+fn a_robot_that_is_cut_off_begins_in_time_and_what_is_away_ends_when_that_is_known() {
+    for server in [None, Some(0.0), Some(4.0)] {
+        let mut world = World::new();
+        world.spec.parts[1].when_cut_off = CutOff::InTime;
+        world.run(6.0);
+        assert_eq!(world.mapping(), ["robot", "near", "near"]);
+        world.hear("robot", false);
+        if let Some(later) = server {
+            world.run(later);
+            world.hear("near", false);
+        }
+        world.run(4.8 - server.unwrap_or_default());
+        assert_eq!(world.live("amcl"), ["app-amcl-2"], "a controller may be starting again");
+        world.run(0.6);
+        assert!(world.live("amcl").contains(&"app-amcl-3".to_owned()), "{server:?}");
+        if server.is_none() {
+            assert_eq!(world.live("amcl"), ["app-amcl-3"]);
+        }
+        world.run(8.0);
+        assert_eq!(world.live("amcl"), ["app-amcl-3"], "{server:?}");
+        world.hear("robot", true);
+        world.hear("near", true);
+        world.run(0.3);
+        let serves = world.part("amcl").task.as_ref().map(|task| task.name.as_str());
+        assert_eq!(serves, Some("app-amcl-3"), "{server:?}");
+        world.run(8.0);
+        assert_eq!(world.mapping(), ["robot", "near", "near"]);
+    }
+}
+
+#[test]
 fn what_stands_by_waits_long_enough_for_what_is_away_whatever_became_of_the_spec() {
     let mut world = settled();
     let begins = |world: &World| {
@@ -376,6 +407,9 @@ fn over_random_traces_no_part_is_lost_twice_or_moved_to_and_fro() {
     for seed in 0..150 {
         let mut numbers = Numbers::new(seed);
         let mut world = World::new();
+        if seed % 2 == 0 {
+            world.spec.parts[1].when_cut_off = CutOff::InTime;
+        }
         for _ in 0..300 {
             world.step();
             match numbers.below(120) {

@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use jiff::{SignedDuration, Timestamp};
 use muster_api::kind::application::{
-    Application, ApplicationSpec, ApplicationStatus, MoveStage, PartStatus,
+    Application, ApplicationSpec, ApplicationStatus, CutOff, MoveStage, PartStatus,
 };
 use muster_api::kind::node::Node;
 use muster_api::kind::task::Task;
@@ -92,7 +92,7 @@ pub(super) fn spec() -> ApplicationSpec {
         "scales": {"gains": {"near": 3.0, "far": 2.0}},
         "parts": [
             {"name": "camera", "template": camera},
-            {"name": "amcl", "cpu": "500m", "template": task_json("amcl")},
+            {"name": "amcl", "cpu": "500m", "whenCutOff": "Fenced", "template": task_json("amcl")},
             {"name": "solo", "cpu": "300m", "template": task_json("solo")},
         ],
         "connections": [
@@ -346,6 +346,10 @@ impl World {
         TaskSeen::of(&task, &application).expect("it is the application's")
     }
 
+    fn is_in_time(&self, part: &str) -> bool {
+        self.spec.part(part).is_some_and(|part| part.when_cut_off == CutOff::InTime)
+    }
+
     /// What must hold at any time.
     fn check(&mut self) {
         let home_is_there = !self.silent.contains_key("robot");
@@ -355,7 +359,12 @@ impl World {
             let live: Vec<&String> =
                 of.clone().filter(|(_, real)| real.is_live()).map(|(name, _)| name).collect();
             let window = part.stage.is_some_and(|stage| stage != MoveStage::Settled);
-            let twice = live.len() > 2 || (live.len() == 2 && !window);
+            // The robot has begun it by itself, and nobody else knows.
+            let standby = part.standby.as_ref().map(|standby| &standby.name);
+            let alone = !home_is_there
+                && self.is_in_time(&part.name)
+                && live.iter().any(|name| Some(*name) == standby);
+            let twice = live.len() > 2 || (live.len() == 2 && !window && !alone);
             assert!(!twice, "{live:?} in {:?} at {}", part.stage, self.now);
             let known: Vec<&String> = part.tasks().map(|task| &task.name).collect();
             let mut all = of.filter(|(name, real)| {
