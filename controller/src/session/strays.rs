@@ -79,7 +79,8 @@ impl Session {
         if appeared {
             self.tell_strays();
         }
-        nodes::write_strays(&self.context, &self.node, &self.stray_names())
+        let is_newest = || self.sessions.is_present(&self.node, self.id);
+        nodes::write_strays(&self.context, &self.node, &self.stray_names(), is_newest)
             .await
             .map_err(internal)?;
         if appeared || self.strays.is_empty() {
