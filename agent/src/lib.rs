@@ -70,5 +70,6 @@ mod supervisor;
 mod told;
 
 pub use app::{AgentError, run, serve};
+pub use link::dial::{DEAF_AFTER, PAUSE as DIAL_PAUSE};
 pub use link::report::to_wire as report_to_wire;
 pub use runtime::process::Reexec;

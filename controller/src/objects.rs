@@ -2,6 +2,11 @@
 //!
 //! Sessions and reconcilers change only `status` (and metadata that is theirs), each through a
 //! read-modify-write that repeats when somebody else wrote in between.
+//!
+//! What is read is on the disk, and may be older than what the disk has: a write that is queued or under way is not read yet,
+//! and one that seemed to fail not before the disk was asked, within a second or when it answers again.
+//! Who finds that nothing is to be written, and lets somebody rely on that, therefore commits that the object is as it was
+//! read: [`change`] does. [`change_watched`] is for those who are told of every later change.
 
 use std::sync::Arc;
 
@@ -74,9 +79,21 @@ pub fn replace<T: Serialize>(stored: &Stored, object: &T) -> Op {
     Op::replace(stored.key.clone(), to_value(object), stored.revision)
 }
 
+/// That an object is as it was read.
+#[must_use]
+pub fn unchanged(stored: &Stored) -> Op {
+    Op::Check { key: stored.key.clone(), precondition: Precondition::revision(stored.revision) }
+}
+
+/// That there is no object of this key.
+#[must_use]
+pub fn absent(key: &Key) -> Op {
+    Op::Check { key: key.clone(), precondition: Precondition::Absent }
+}
+
 /// Reads an object, lets `change` make operations of it, and applies them as one transaction; again
 /// when anything they depend on changed in between. `None` from `change` or no such object: nothing
-/// is done.
+/// is written, and `None` is returned when it is certain that this is what the disk has.
 ///
 /// # Errors
 ///
@@ -87,26 +104,53 @@ pub async fn change<T: DeserializeOwned>(
     mut change: impl FnMut(&Arc<Stored>, T) -> Option<Vec<Op>>,
 ) -> Result<Option<Arc<Stored>>, StoreError> {
     loop {
-        let Some(stored) = store.get(key) else { return Ok(None) };
-        let Some(object) = read::<T>(&stored) else { return Ok(None) };
-        let Some(ops) = change(&stored, object) else { return Ok(None) };
-        match store.apply(ops).await {
-            Ok(mut written) => return Ok(Some(written.swap_remove(0))),
-            Err(error) if is_race(&error) => tokio::task::yield_now().await,
-            Err(error) => return Err(error),
+        let stored = store.get(key);
+        let as_read = || vec![stored.as_deref().map_or_else(|| absent(key), unchanged)];
+        let ops = operations(stored.as_ref(), &mut change).unwrap_or_else(as_read);
+        if let Some(written) = commit(store, ops).await? {
+            return Ok(written.into_iter().next());
         }
     }
 }
 
-/// Whether an object is still what was read, also when it is known of every write that seemed to fail whether the disk has
-/// it: who finds that nothing is to be written, and is not told of changes, must know that.
+/// The same for a loop that follows the store's events, or looks again soon: what is not read yet comes to it later, and
+/// finding nothing to write costs it no turn of the writer.
 ///
 /// # Errors
 ///
-/// While the disk cannot be asked.
-pub async fn is_still(store: &Store, stored: &Stored) -> Result<bool, StoreError> {
-    store.settled().await?;
-    Ok(store.get(&stored.key).is_some_and(|now| now.revision == stored.revision))
+/// As [`change`].
+pub async fn change_watched<T: DeserializeOwned>(
+    store: &Store,
+    key: &Key,
+    mut change: impl FnMut(&Arc<Stored>, T) -> Option<Vec<Op>>,
+) -> Result<Option<Arc<Stored>>, StoreError> {
+    while let Some(ops) = operations(store.get(key).as_ref(), &mut change) {
+        if let Some(written) = commit(store, ops).await? {
+            return Ok(written.into_iter().next());
+        }
+    }
+    Ok(None)
+}
+
+/// None: there is no such object, or nothing of it is to be changed.
+fn operations<T: DeserializeOwned>(
+    stored: Option<&Arc<Stored>>,
+    change: &mut impl FnMut(&Arc<Stored>, T) -> Option<Vec<Op>>,
+) -> Option<Vec<Op>> {
+    let stored = stored?;
+    change(stored, read(stored)?)
+}
+
+/// None: somebody else was first.
+async fn commit(store: &Store, ops: Vec<Op>) -> Result<Option<Vec<Arc<Stored>>>, StoreError> {
+    match store.apply(ops).await {
+        Ok(written) => Ok(Some(written)),
+        Err(error) if is_race(&error) => {
+            tokio::task::yield_now().await;
+            Ok(None)
+        }
+        Err(error) => Err(error),
+    }
 }
 
 /// Somebody else was first; reading again shows what is now.
@@ -154,7 +198,7 @@ pub fn unlocked(store: &Store, node: &str) -> Result<Op, Locked> {
     let object: Node = read(&stored).ok_or(Locked::Gone)?;
     match object.mission_lock() {
         Some(lock) => Err(Locked::By(lock)),
-        None => Ok(Op::Check { key, precondition: Precondition::revision(stored.revision) }),
+        None => Ok(unchanged(&stored)),
     }
 }
 
@@ -218,4 +262,82 @@ pub fn task_key(task: &Task) -> Key {
 #[must_use]
 pub fn node_name(node: &Node) -> &str {
     node.metadata.name.as_deref().unwrap_or_default()
+}
+
+#[cfg(test)]
+mod tests {
+    use futures::FutureExt as _;
+    use serde_json::json;
+
+    use super::*;
+    use crate::store::memory;
+
+    fn key() -> Key {
+        node_key("r1")
+    }
+
+    async fn create(store: &Store) -> Result<Arc<Stored>, StoreError> {
+        let value = json!({"metadata": {"name": "r1", "uid": "u"}, "word": "first"});
+        store.create(key(), value).await
+    }
+
+    /// Writes a word where another one stands.
+    async fn say(store: &Store, word: &str) -> Result<Option<Arc<Stored>>, StoreError> {
+        change(store, &key(), |stored, mut object: Value| {
+            if object["word"] == word {
+                return None;
+            }
+            object["word"] = word.into();
+            Some(vec![replace(stored, &object)])
+        })
+        .await
+    }
+
+    async fn kept(store: &Store) -> Value {
+        store.settled().await.expect("the disk answers");
+        store.get(&key()).expect("it is there").value()["word"].take()
+    }
+
+    #[tokio::test]
+    async fn nothing_is_to_be_written_where_the_disk_says_the_same() {
+        let (store, failures) = memory::start_failing().await;
+        create(&store).await.expect("it is new");
+        failures.mislead_next(1);
+        say(&store, "second").await.expect_err("it seems to fail");
+        let written = say(&store, "first").await.expect("the disk is well");
+        assert!(written.is_some(), "the disk had the other word");
+        assert_eq!(kept(&store).await, "first");
+        failures.fail_next(1);
+        say(&store, "second").await.expect_err("it fails");
+        assert_eq!(say(&store, "first").await.expect("the disk is well"), None);
+        assert_eq!(kept(&store).await, "first");
+    }
+
+    #[tokio::test]
+    async fn a_write_that_nobody_waits_for_any_more_is_not_what_stands_at_the_end() {
+        let store = memory::start().await;
+        create(&store).await.expect("it is new");
+        assert!(say(&store, "second").now_or_never().is_none(), "it is queued");
+        say(&store, "first").await.expect("the disk is well");
+        assert_eq!(kept(&store).await, "first");
+    }
+
+    #[tokio::test]
+    async fn an_object_is_not_there_where_the_disk_has_none() {
+        let (store, failures) = memory::start_failing().await;
+        assert_eq!(say(&store, "second").await.expect("the disk is well"), None);
+        failures.mislead_next(1);
+        create(&store).await.expect_err("it seems to fail");
+        assert!(say(&store, "second").await.expect("the disk is well").is_some());
+        assert_eq!(kept(&store).await, "second");
+    }
+
+    #[tokio::test]
+    async fn who_is_told_of_changes_does_not_wait_for_the_disk() {
+        let (store, writer, _) = memory::open().await;
+        let nothing = |_: &Arc<Stored>, _: Value| None;
+        let found = change_watched(&store, &key(), nothing).now_or_never();
+        assert!(matches!(found, Some(Ok(None))), "nobody writes, and nobody is asked");
+        drop(writer);
+    }
 }

@@ -10,12 +10,14 @@
 //! | [`ros`] | a real ROS 1: a roscore of its own, and programs that talk to it |
 //! | [`docker`] | an image without a registry |
 //! | [`registry`] | a registry of images on loopback |
+//! | [`dice`] | random choices of a seed |
 //! | [`kernel`] | what the kernel says: processes, start times, cgroups |
 //! | [`netns`], [`wire`] | network namespaces, and wires between them with delay, losses, a rate and cuts |
 //!
 //! A missing piece (a binary, root, Docker) fails the test that needs it; nothing is skipped.
 
 pub mod cluster;
+pub mod dice;
 pub mod docker;
 pub mod echo;
 pub mod kernel;

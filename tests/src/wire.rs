@@ -10,7 +10,6 @@
 
 use std::io;
 use std::os::fd::{AsFd as _, OwnedFd};
-use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
@@ -20,6 +19,7 @@ use tokio::sync::mpsc;
 use tokio::time::Instant;
 use tokio_util::sync::CancellationToken;
 
+use crate::dice::Dice;
 use crate::netns::{Namespace, ip};
 
 /// Packets that wait where the rate is the bottleneck, bytes: a Wi-Fi router's buffer.
@@ -28,7 +28,7 @@ const QUEUE: f64 = 256.0 * 1024.0;
 const MTU: usize = 1_500;
 
 /// What one direction does to packets.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Way {
     /// Nothing arrives.
     pub cut: bool,
@@ -47,27 +47,14 @@ impl Way {
     pub const CUT: Way = Way { cut: true, ..Way::CLEAR };
 }
 
-/// One direction: what it does, and what has arrived.
-#[derive(Debug)]
-struct Lane {
-    way: Mutex<Way>,
-    bytes: AtomicU64,
-}
-
-impl Lane {
-    fn new() -> Arc<Lane> {
-        Arc::new(Lane { way: Mutex::new(Way::CLEAR), bytes: AtomicU64::new(0) })
-    }
-}
+/// What one direction does now.
+type Lane = Arc<Mutex<Way>>;
 
 /// A wire, until it is dropped.
 #[derive(Debug)]
 pub struct Wire {
-    /// Of the near end, and of the far one.
-    near: String,
-    far: String,
-    down: Arc<Lane>,
-    up: Arc<Lane>,
+    down: Lane,
+    up: Lane,
     stop: CancellationToken,
     thread: Option<std::thread::JoinHandle<()>>,
 }
@@ -84,14 +71,14 @@ impl Wire {
         let name = format!("wire{number}");
         let near_end = device(&name, &here, &there);
         let far_end = far.run({
-            let (name, here, there) = (name.clone(), here.clone(), there.clone());
+            let name = name.clone();
             move || {
                 let end = device(&name, &there, &here);
                 ip(&format!("route add default via {here}"));
                 end
             }
         });
-        let (down, up, stop) = (Lane::new(), Lane::new(), CancellationToken::new());
+        let (down, up, stop) = (Lane::default(), Lane::default(), CancellationToken::new());
         let thread = std::thread::Builder::new().name(name).spawn({
             let (down, up, stop) = (down.clone(), up.clone(), stop.clone());
             move || {
@@ -106,31 +93,13 @@ impl Wire {
                 });
             }
         });
-        Wire { near: here, far: there, down, up, stop, thread: Some(thread.expect("a thread")) }
-    }
-
-    /// The address of its near end.
-    #[must_use]
-    pub fn near(&self) -> &str {
-        &self.near
-    }
-
-    /// The address of its far end.
-    #[must_use]
-    pub fn far(&self) -> &str {
-        &self.far
+        Wire { down, up, stop, thread: Some(thread.expect("a thread")) }
     }
 
     /// What happens from now on to packets towards the far end, and to those that come from it.
     pub fn shape(&self, down: Way, up: Way) {
-        *self.down.way.lock().expect("nobody panics with it") = down;
-        *self.up.way.lock().expect("nobody panics with it") = up;
-    }
-
-    /// Bytes that have arrived at the far end, and at the near one.
-    #[must_use]
-    pub fn carried(&self) -> (u64, u64) {
-        (self.down.bytes.load(Ordering::Relaxed), self.up.bytes.load(Ordering::Relaxed))
+        *self.down.lock().expect("nobody panics with it") = down;
+        *self.up.lock().expect("nobody panics with it") = up;
     }
 }
 
@@ -152,25 +121,21 @@ fn watched(end: OwnedFd) -> Arc<AsyncFd<OwnedFd>> {
 }
 
 /// Carries packets one way, for ever.
-async fn carry(from: Arc<AsyncFd<OwnedFd>>, to: Arc<AsyncFd<OwnedFd>>, lane: Arc<Lane>, seed: u64) {
+async fn carry(from: Arc<AsyncFd<OwnedFd>>, to: Arc<AsyncFd<OwnedFd>>, lane: Lane, seed: u64) {
     let (send, mut due) = mpsc::unbounded_channel::<(Instant, Vec<u8>)>();
-    let arrive = {
-        let lane = lane.clone();
-        async move {
-            while let Some((at, packet)) = due.recv().await {
-                tokio::time::sleep_until(at).await;
-                lane.bytes.fetch_add(packet.len() as u64, Ordering::Relaxed);
-                let _ = write(&to, &packet).await;
-            }
+    let arrive = async move {
+        while let Some((at, packet)) = due.recv().await {
+            tokio::time::sleep_until(at).await;
+            let _ = write(&to, &packet).await;
         }
     };
     let leave = async move {
-        let mut state = seed;
+        let mut dice = Dice::new(seed);
         let (mut free_at, mut last) = (Instant::now(), Instant::now());
         loop {
             let Ok(packet) = read(&from).await else { return };
-            let way = *lane.way.lock().expect("nobody panics with it");
-            if way.cut || chance(&mut state) < way.loss {
+            let way = *lane.lock().expect("nobody panics with it");
+            if way.cut || dice.share() < way.loss {
                 continue;
             }
             let now = Instant::now();
@@ -188,15 +153,6 @@ async fn carry(from: Arc<AsyncFd<OwnedFd>>, to: Arc<AsyncFd<OwnedFd>>, lane: Arc
         }
     };
     tokio::join!(arrive, leave);
-}
-
-/// A number from 0 to 1, by splitmix64.
-fn chance(state: &mut u64) -> f64 {
-    *state = state.wrapping_add(0x9e37_79b9_7f4a_7c15);
-    let mut z = *state;
-    z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-    z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-    ((z ^ (z >> 31)) >> 11) as f64 / (1_u64 << 53) as f64
 }
 
 async fn read(end: &AsyncFd<OwnedFd>) -> io::Result<Vec<u8>> {

@@ -29,10 +29,10 @@ pub(crate) mod service {
 
 /// First and longest pause between two tries. The first is short, because a controller that is
 /// started anew is back within seconds; the longest bounds how long a robot is alone for nothing.
-const PAUSE: (Duration, Duration) = (Duration::from_millis(50), Duration::from_secs(2));
+pub const PAUSE: (Duration, Duration) = (Duration::from_millis(50), Duration::from_secs(2));
 
 /// A connection on which nothing was heard for this long is given up.
-pub(crate) const DEAF_AFTER: Duration = Duration::from_secs(10);
+pub const DEAF_AFTER: Duration = Duration::from_secs(10);
 
 /// Pauses between tries, each twice as long as the one before it.
 #[derive(Debug)]

@@ -90,7 +90,7 @@ async fn follow(context: &Context) -> Result<(), StoreError> {
 
 async fn act(context: &Context, key: &Key, now: Timestamp) -> Result<(), StoreError> {
     let mut stopped = None;
-    objects::change(&context.store, key, |stored, mut task: Task| {
+    objects::change_watched(&context.store, key, |stored, mut task: Task| {
         stopped = None;
         match due(&task).filter(|due| due.at() <= now)? {
             Due::Stop(_) => {

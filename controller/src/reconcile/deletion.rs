@@ -46,7 +46,7 @@ async fn follow(context: &Context) -> Result<(), StoreError> {
 }
 
 async fn consider(context: &Context, key: &Key) -> Result<(), StoreError> {
-    objects::change(&context.store, key, |stored, task: Task| {
+    objects::change_watched(&context.store, key, |stored, task: Task| {
         let phase = task.status.as_ref().map_or(TaskPhase::Pending, |s| s.phase);
         let over = phase.is_terminal() || phase == TaskPhase::Pending;
         let deleting = task.metadata.deletion_timestamp.is_some();

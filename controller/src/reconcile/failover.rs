@@ -167,7 +167,7 @@ async fn write_view(
     tasks: u32,
 ) -> Result<(), StoreError> {
     let offers = u32::try_from(view.offered).unwrap_or(u32::MAX);
-    objects::change(&context.store, &key, |stored, mut object: Framework| {
+    objects::change_watched(&context.store, &key, |stored, mut object: Framework| {
         let status = object.status.get_or_insert_default();
         let same = status.offers == offers
             && status.tasks == tasks

@@ -125,7 +125,7 @@ async fn end(
     left: &Left,
 ) -> Result<(), StoreError> {
     let (mut ordered, mut kept): (Option<Task>, Option<MissionLock>) = (None, None);
-    objects::change(&context.store, key, |stored, mut task: Task| {
+    objects::change_watched(&context.store, key, |stored, mut task: Task| {
         (ordered, kept) = (None, None);
         let status = task.status.as_mut()?;
         let same = stored.uid == placed.uid && status.node.as_deref() == Some(&*placed.node);

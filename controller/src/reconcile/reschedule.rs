@@ -118,7 +118,7 @@ fn take_in(
 
 async fn consider(context: &Context, belongings: &Belongings, key: &Key) -> Result<(), StoreError> {
     let mut new = None;
-    objects::change(&context.store, key, |stored, mut task: Task| {
+    objects::change_watched(&context.store, key, |stored, mut task: Task| {
         new = None;
         match step(&task, context.clock.now()) {
             Step::Nothing => None,

@@ -83,7 +83,7 @@ fn take_in(change: Change, stored: &Stored, dirty: &mut BTreeSet<Key>) {
 async fn look(context: &Context, key: &Key) -> Result<Option<Timestamp>, StoreError> {
     let now = context.clock.now();
     let mut seen = None;
-    objects::change(&context.store, key, |stored, mut node: Node| {
+    objects::change_watched(&context.store, key, |stored, mut node: Node| {
         let upkeep = upkeep::upkeep(&node, now);
         let changed = set(&mut node, &upkeep, now);
         seen = Some(upkeep);
@@ -118,7 +118,7 @@ async fn drain_node(context: &Context, node: &str, why: &str) -> Result<(), Stor
             continue;
         }
         let mut ordered = None;
-        objects::change(&context.store, &stored.key, |present, mut task: Task| {
+        objects::change_watched(&context.store, &stored.key, |present, mut task: Task| {
             ordered = None;
             let status = task.status.as_mut()?;
             let concerns = status.phase.holds_node() && status.node.as_deref() == Some(node);

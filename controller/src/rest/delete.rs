@@ -286,7 +286,14 @@ async fn end_guarded(
         None => None,
     };
     loop {
-        let present = context.store.get(key).ok_or_else(|| Failure::not_found(entry, name))?;
+        let Some(present) = context.store.get(key) else {
+            match context.store.apply(vec![objects::absent(key)]).await {
+                Ok(_) => return Err(Failure::not_found(entry, name)),
+                // Its creation seemed to fail, or was under way.
+                Err(StoreError::AlreadyExists { .. }) => continue,
+                Err(error) => return Err(Failure::of_store(entry, name, &error)),
+            }
+        };
         if entry.info.kind == "Node" {
             refuse_in_use(context, entry, name)?;
             refuse_stopped(entry, &present)?;
@@ -436,4 +443,27 @@ fn gone(entry: &Entry, stored: &Stored) -> Response {
         },
     });
     super::json(StatusCode::OK, &status)
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::*;
+    use crate::store::memory;
+
+    #[tokio::test]
+    async fn what_is_not_found_is_not_on_the_disk_either() {
+        let dir = tempfile::tempdir().expect("a directory");
+        let (store, failures) = memory::start_failing().await;
+        let context = crate::context::for_tests(dir.path(), store);
+        let key = Key::namespaced(Resource::new("configmaps"), "default", "m");
+        failures.mislead_next(1);
+        let value = json!({"metadata": {"name": "m", "namespace": "default", "uid": "u"}});
+        context.store.create(key.clone(), value).await.expect_err("it seems to fail");
+        let gone = delete_object(&context, &key).await.map_err(|failure| failure.code());
+        assert_eq!(gone.map(|last| last.uid.to_string()), Ok("u".to_owned()));
+        let gone = delete_object(&context, &key).await.map_err(|failure| failure.code());
+        assert_eq!(gone.map(drop), Err(404));
+    }
 }

@@ -29,6 +29,7 @@ use super::{Answer, Call, body, failure::Failure};
 use crate::audit::Named;
 use crate::context::{Context, Live};
 use crate::objects::{self, NODES, TASKS};
+use crate::session::Sessions;
 use crate::session::nodes::STRAY_TASKS;
 use crate::store::{Key, Op, Precondition, Stored};
 
@@ -69,7 +70,7 @@ pub(super) async fn answer(call: Call, target: Object, step: Step) -> Answer {
     let word = Word { user: asker.identity.name(), reason: asked.reason.trim().to_owned() };
     let live = context.live();
     let live = live.ok_or_else(|| Failure::unavailable("no session service is running"))?;
-    let done = carry_out(&context, live, (&target, &key), step, &word).await?;
+    let done = carry_out(&context, &live.sessions, (&target, &key), step, &word).await?;
     if done.changed {
         live.sessions.orders().tell_lease(&done.lease, done.stored.revision);
         tell(&context, &done, step, &word);
@@ -92,7 +93,7 @@ pub(super) async fn answer(call: Call, target: Object, step: Step) -> Answer {
 
 async fn carry_out(
     context: &Context,
-    live: &Live,
+    sessions: &Sessions,
     (target, key): (&Object, &Key),
     step: Step,
     word: &Word,
@@ -103,20 +104,14 @@ async fn carry_out(
         let mut lease: Lease = objects::read(&stored)
             .ok_or_else(|| Failure::internal(format!("lease {name:?} does not read as one")))?;
         let before = lease.status.clone().unwrap_or_default();
-        let robot = robot(context, live, &lease);
+        let robot = robot(context, sessions, &lease);
         let outcome = person::step(step, &word.user, &before, &robot).map_err(|refused| {
             let message = format!("lease {name:?}: {refused}");
             Failure::new(StatusCode::CONFLICT, refused.reason(), message).about(entry, name)
         })?;
+        let changed = outcome != Outcome::AsItWas;
         let from = match outcome {
-            Outcome::AsItWas => {
-                // They may have given it back, and were told that this failed.
-                let still = objects::is_still(&context.store, &stored).await;
-                if !still.map_err(|error| Failure::of_store(entry, name, &error))? {
-                    continue;
-                }
-                return Ok(Done { stored, lease, from: None, changed: false, robot });
-            }
+            Outcome::AsItWas => None,
             Outcome::Held { mut status, from } => {
                 status.acquired = Some(MicroTime(context.clock.now()));
                 lease.status = Some(status);
@@ -131,10 +126,15 @@ async fn carry_out(
             key: Key::cluster(NODES, lease.spec.node.as_str()),
             precondition: Precondition::PRESENT,
         };
-        match context.store.apply(vec![node, objects::replace(&stored, &lease)]).await {
+        let lease_op = match changed {
+            true => objects::replace(&stored, &lease),
+            // They may have given it back, and were told that this failed.
+            false => objects::unchanged(&stored),
+        };
+        match context.store.apply(vec![node, lease_op]).await {
             Ok(mut written) => {
                 let stored = written.pop().unwrap_or(stored);
-                return Ok(Done { stored, lease, from, changed: true, robot });
+                return Ok(Done { stored, lease, from, changed, robot });
             }
             Err(error) if objects::is_race(&error) => {
                 if context.store.get(&objects::node_key(&lease.spec.node)).is_none() {
@@ -149,7 +149,7 @@ async fn carry_out(
 }
 
 /// What its robot is able to.
-fn robot(context: &Context, live: &Live, lease: &Lease) -> Robot {
+fn robot(context: &Context, sessions: &Sessions, lease: &Lease) -> Robot {
     let name = lease.spec.node.as_str();
     let node = context.store.get(&objects::node_key(name));
     let node = node.and_then(|stored| objects::read::<Node>(&stored));
@@ -160,7 +160,7 @@ fn robot(context: &Context, live: &Live, lease: &Lease) -> Robot {
         Some(condition) => Some(condition.message.clone()),
         None => Some("no gate stands before its drivers".to_owned()),
     };
-    let is_heard = NodeName::new(name).is_ok_and(|name| live.sessions.is_heard(&name));
+    let is_heard = NodeName::new(name).is_ok_and(|name| sessions.is_heard(&name));
     let is_driven = is_driven(context, lease) || status.as_ref().is_some_and(runs_strays);
     Robot { unfenced, is_heard, is_driven }
 }
@@ -239,5 +239,60 @@ fn tell(context: &Context, done: &Done, step: Step, word: &Word) {
     if let Some(task) = task.and_then(|stored| objects::read::<Task>(&stored)) {
         let message = format!("{user} took the actuators of {node} from it{why}");
         context.events.warn_task(&task, reason, message);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use muster_api::kind::lease::LeaseStatus;
+    use muster_api::kind::node::{NodeKind, NodeSpec};
+
+    use super::super::registry;
+    use super::*;
+    use crate::objects::LEASES;
+    use crate::store::memory;
+
+    #[tokio::test]
+    async fn who_is_told_that_a_robot_is_theirs_as_it_was_has_it() {
+        let dir = tempfile::tempdir().expect("a directory");
+        let (store, failures) = memory::start_failing().await;
+        let context = crate::context::for_tests(dir.path(), store);
+        let sessions = Sessions::default();
+        let mut node = Node::new("r1", NodeSpec::new(NodeKind::Robot));
+        objects::stamp_new(&mut node.metadata, context.clock.now());
+        let spec = LeaseSpec {
+            node: "r1".to_owned(),
+            group: DEFAULT_GROUP.to_owned(),
+            actuators: Vec::new(),
+        };
+        let key = objects::lease_key("r1", DEFAULT_GROUP);
+        let mut lease = Lease::new(&key.name, spec);
+        objects::stamp_new(&mut lease.metadata, context.clock.now());
+        lease.status = Some(LeaseStatus::default());
+        let ops = vec![
+            objects::create(objects::node_key("r1"), &node),
+            objects::create(key.clone(), &lease),
+        ];
+        context.store.apply(ops).await.expect("they are new");
+        let target = Object {
+            entry: registry::of(LEASES).expect("they are served"),
+            namespace: None,
+            name: Some(key.name.to_string()),
+            subresource: None,
+        };
+        let word = Word { user: "ada".to_owned(), reason: String::new() };
+        let ada = async |step| carry_out(&context, &sessions, (&target, &key), step, &word).await;
+        let told = |done: Result<Done, Failure>| {
+            let done = done.unwrap_or_else(|failure| panic!("{}", failure.message()));
+            (done.changed, done.lease.status.expect("it has one").epoch)
+        };
+        assert_eq!(told(ada(Step::Acquire).await), (true, Epoch(1)));
+        assert_eq!(told(ada(Step::Acquire).await), (false, Epoch(1)));
+        failures.mislead_next(1);
+        assert!(ada(Step::Return).await.is_err(), "it seems to fail");
+        assert_eq!(told(ada(Step::Acquire).await), (true, Epoch(2)), "it was given back");
+        let lease: Lease = objects::read(&context.store.get(&key).expect("there")).expect("one");
+        let holder = lease.status.and_then(|status| status.holder);
+        assert_eq!(holder.map(|holder| holder.name).as_deref(), Some("ada"));
     }
 }

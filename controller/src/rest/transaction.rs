@@ -26,7 +26,7 @@ use crate::auth::{self, Asker};
 use crate::context::Context;
 use crate::objects::{self, LEASES, NODES, QUOTAS, SITES, TASKS};
 use crate::quota::Pass;
-use crate::store::{Op, Precondition, Resource};
+use crate::store::{Op, Resource};
 
 /// Whose objects a plan looks at: a change of any of them may be another plan.
 const LOOKED_AT: &[Resource] = &[
@@ -247,7 +247,10 @@ impl<'a> Work<'a> {
                 self.ops.push(op);
                 Ok(Done::Written)
             }
-            None => Ok(Done::As(present.value())),
+            None => {
+                self.ops.push(objects::unchanged(&present));
+                Ok(Done::As(present.value()))
+            }
         }
     }
 
@@ -264,8 +267,7 @@ impl<'a> Work<'a> {
         let present = self.context.store.get(&key);
         let same = present.filter(|p| p.revision.to_string() == check.resource_version);
         let present = same.ok_or_else(|| Failure::stale(target.entry, &key.name))?;
-        let precondition = Precondition::revision(present.revision);
-        self.ops.push(Op::Check { key, precondition });
+        self.ops.push(objects::unchanged(&present));
         Ok(Done::As(present.value()))
     }
 }

@@ -22,6 +22,7 @@ use super::registry::{Entry, View};
 use super::{Answer, Call, admission, body, failure::Failure, host, launched, metadata, owners};
 use crate::auth::Asker;
 use crate::context::Context;
+use crate::objects;
 use crate::store::{Op, Precondition, Store, StoreError, Stored};
 
 /// How a change is made.
@@ -103,16 +104,16 @@ pub(super) async fn change(
     }
 }
 
-/// Writes what an object becomes: nothing when nothing changed, a removal when it was only waiting to be let go.
+/// Writes what an object becomes: nothing when nothing changed, a removal when it was only waiting to be let go. The client
+/// relies on an answer of either kind.
 async fn write(
     store: &Store,
     present: &Arc<Stored>,
     object: &Value,
 ) -> Result<Arc<Stored>, StoreError> {
-    match operation(present, object) {
-        Some(op) => store.apply_one(op).await,
-        None => Ok(Arc::clone(present)),
-    }
+    let op = operation(present, object).unwrap_or_else(|| objects::unchanged(present));
+    let mut written = store.apply(vec![op]).await?;
+    Ok(written.pop().unwrap_or_else(|| Arc::clone(present)))
 }
 
 /// The same as an operation, while the object is what it was; none: nothing changed.
@@ -293,4 +294,26 @@ fn check_finalizers(entry: &Entry, name: &str, old: &Value, new: &Value) -> Resu
         "no new finalizers can be added if the object is being deleted",
     );
     Err(Failure::invalid(entry, name, &violations))
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::*;
+    use crate::store::memory;
+
+    #[tokio::test]
+    async fn a_client_is_told_that_nothing_changes_where_the_disk_has_the_same() {
+        let (store, failures) = memory::start_failing().await;
+        let key = objects::node_key("r1");
+        let object = |n| json!({"metadata": {"name": "r1", "uid": "u"}, "spec": {"n": n}});
+        let present = store.create(key, object(1)).await.expect("it is new");
+        let same = present.value();
+        assert_eq!(write(&store, &present, &same).await.expect("the disk is well"), present);
+        failures.mislead_next(1);
+        write(&store, &present, &object(2)).await.expect_err("it seems to fail");
+        let said = write(&store, &present, &same).await;
+        assert!(matches!(said, Err(StoreError::Conflict { .. })), "{said:?}");
+    }
 }

@@ -193,7 +193,7 @@ pub(super) struct Session {
     pub(super) context: Arc<Context>,
     pub(super) sessions: Arc<Sessions>,
     poses: Arc<LivePoses>,
-    id: u64,
+    pub(super) id: u64,
     pub(super) node: NodeName,
     /// Of the agent's certificate.
     key: String,
@@ -422,9 +422,9 @@ impl Session {
 
     /// No later session of this node has begun; what an earlier one still reads is old.
     pub(super) fn is_newest(&self) -> Result<(), End> {
-        match self.sessions.connection(&self.node).is_some_and(|c| c.id == self.id) {
+        match self.sessions.is_present(&self.node, self.id) {
             true => Ok(()),
-            false => Err(Status::aborted("a later session of this node has begun").into()),
+            false => Err(replaced(&self.node)),
         }
     }
 
@@ -507,9 +507,12 @@ impl Session {
             NodeReport::try_from(state).map_err(|e| Status::invalid_argument(e.to_string()))?;
         // The Node is written for the rest of the report anyway, so what counts is written with it.
         report.pose = report.pose.filter(|pose| self.say_pose(pose));
-        let written = nodes::write(&self.context, speaker, &report, &self.stray_names()).await;
+        let strays = self.stray_names();
+        let is_newest = || self.sessions.is_present(&self.node, self.id);
+        let written = nodes::write(&self.context, speaker, &report, &strays, is_newest).await;
         self.node_uid = written.map_err(|error| match error {
             nodes::NodeError::Store(store) => internal(store),
+            nodes::NodeError::Replaced { node } => replaced(&node),
             error => refused(&error),
         })?;
         Ok(())
@@ -528,6 +531,10 @@ fn status(error: &nodes::NodeError) -> Status {
         }
         _ => Status::failed_precondition(error.to_string()),
     }
+}
+
+fn replaced(node: &NodeName) -> End {
+    Status::aborted(format!("a later session of {node} has begun")).into()
 }
 
 /// The agent tries again; what it said is not lost, it repeats it.

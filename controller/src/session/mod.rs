@@ -277,6 +277,11 @@ impl Sessions {
         lock(&self.connections).get(node).cloned()
     }
 
+    /// The session with this number is the present one of the node.
+    pub(crate) fn is_present(&self, node: &NodeName, session: u64) -> bool {
+        self.connection(node).is_some_and(|connection| connection.id == session)
+    }
+
     /// Held while a session begins.
     pub(crate) async fn begin(&self) -> RwLockReadGuard<'_, ()> {
         self.beginnings.read().await

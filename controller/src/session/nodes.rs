@@ -48,6 +48,8 @@ pub(crate) enum NodeError {
         "the certificate is not that of node {node}'s agent: the node was registered anew, or another agent has joined in its place; `muster token create --node {node}` makes a token with which this agent may join again"
     )]
     OtherAgent { node: NodeName },
+    #[error("a later session of node {node} has begun")]
+    Replaced { node: NodeName },
     #[error(transparent)]
     Store(#[from] StoreError),
 }
@@ -67,16 +69,21 @@ pub(crate) fn admit(
     Ok((stored, node))
 }
 
-/// Writes what an agent says of its node; gives the Node's uid. Ready becomes true, unless it runs
-/// `strays`.
+/// Writes what an agent says of its node, while the session `is_newest`; gives the Node's uid. Ready becomes true, unless it
+/// runs `strays`.
 pub(crate) async fn write(
     context: &Context,
     speaker: &Speaker,
     report: &NodeReport,
     strays: &[String],
+    is_newest: impl Fn() -> bool,
 ) -> Result<Box<str>, NodeError> {
     loop {
         let (stored, mut node) = admit(context, &speaker.node, &speaker.key)?;
+        // At every try, after reading: what a later session has written since is not written over.
+        if !is_newest() {
+            return Err(NodeError::Replaced { node: speaker.node.clone() });
+        }
         if node.spec.kind != report.kind {
             return Err(NodeError::KindChanged {
                 node: speaker.node.clone(),
@@ -88,12 +95,11 @@ pub(crate) async fn write(
         fill(context, speaker, report, &mut node);
         judge(node.status.get_or_insert_default(), strays, context.clock.now());
         let mut ops = Vec::new();
-        if node != before {
-            ops.push(objects::replace(&stored, &node));
-        } else if !objects::is_still(&context.store, &stored).await? {
-            // What its agent said before was written after all, and is not what it says now.
-            continue;
-        }
+        // What its agent said before may be written after all, and is not what it says now.
+        ops.push(match node == before {
+            true => objects::unchanged(&stored),
+            false => objects::replace(&stored, &node),
+        });
         ops.extend(free_lease(context, speaker, report));
         match context.store.apply(ops).await {
             Ok(_) => {
@@ -198,14 +204,18 @@ fn judge(status: &mut NodeStatus, strays: &[String], now: jiff::Timestamp) {
     }
 }
 
-/// Writes that the strays of a connected agent are others than before.
+/// Writes that the strays of a connected agent are others than before, while the session `is_newest`.
 pub(crate) async fn write_strays(
     context: &Context,
     node: &NodeName,
     strays: &[String],
+    is_newest: impl Fn() -> bool,
 ) -> Result<(), StoreError> {
     let key = objects::node_key(node.as_str());
     objects::change(&context.store, &key, |stored, mut object: Node| {
+        if !is_newest() {
+            return None;
+        }
         let before = object.clone();
         judge(object.status.get_or_insert_default(), strays, context.clock.now());
         (object != before).then(|| vec![objects::replace(stored, &object)])
@@ -216,33 +226,19 @@ pub(crate) async fn write_strays(
 
 #[cfg(test)]
 mod tests {
+    use std::path::Path;
+    use std::pin::pin;
+    use std::sync::atomic::{AtomicBool, Ordering};
+
     use muster_api::kind::node::NodeSpec;
     use muster_api::kind::node::estop::{EStopStatus, EStopTier};
     use muster_api::resource::Compute;
-    use tokio_util::sync::CancellationToken;
 
     use super::*;
-    use crate::store::memory;
+    use crate::store::{Key, Store, memory};
 
-    #[tokio::test]
-    async fn what_seemed_to_fail_and_is_there_all_the_same_is_not_what_stands_at_the_end() {
-        let (store, writer, failures) = memory::open().await;
-        let writes = tokio::spawn(writer.run(CancellationToken::new()));
-        let dir = tempfile::tempdir().expect("a directory");
-        let context = crate::context::for_tests(dir.path(), store);
-        let name = NodeName::new("r1").expect("a name");
-        let mut node = Node::new("r1", NodeSpec::new(NodeKind::Robot));
-        objects::stamp_new(&mut node.metadata, context.clock.now());
-        node.status.get_or_insert_default().agent_keys = vec!["key".to_owned()];
-        let key = objects::node_key("r1");
-        context.store.apply_one(objects::create(key.clone(), &node)).await.expect("it is new");
-        let speaker = Speaker {
-            node: name,
-            key: "key".to_owned(),
-            incarnation: Incarnation::new("1".to_owned()),
-            version: String::new(),
-        };
-        let report = |estop: Option<EStopStatus>| NodeReport {
+    fn report(estop: Option<EStopStatus>) -> NodeReport {
+        NodeReport {
             kind: NodeKind::Robot,
             labels: std::collections::BTreeMap::new(),
             capacity: Compute::default(),
@@ -258,17 +254,85 @@ mod tests {
             mission_locks: Vec::new(),
             estop,
             images: Vec::new(),
-        };
-        let cut = Some(EStopStatus { tier: EStopTier::Cut, ..EStopStatus::default() });
-        write(&context, &speaker, &report(cut.clone()), &[]).await.expect("the disk is well");
+        }
+    }
+
+    fn cut() -> Option<EStopStatus> {
+        Some(EStopStatus { tier: EStopTier::Cut, ..EStopStatus::default() })
+    }
+
+    /// A Node in a store, and who speaks for it.
+    struct Robot {
+        context: Arc<Context>,
+        key: Key,
+        speaker: Speaker,
+    }
+
+    impl Robot {
+        async fn new(dir: &Path, store: Store) -> Robot {
+            let context = crate::context::for_tests(dir, store);
+            let mut node = Node::new("r1", NodeSpec::new(NodeKind::Robot));
+            objects::stamp_new(&mut node.metadata, context.clock.now());
+            node.status.get_or_insert_default().agent_keys = vec!["key".to_owned()];
+            let key = objects::node_key("r1");
+            context.store.apply_one(objects::create(key.clone(), &node)).await.expect("it is new");
+            let speaker = Speaker {
+                node: NodeName::new("r1").expect("a name"),
+                key: "key".to_owned(),
+                incarnation: Incarnation::new("1".to_owned()),
+                version: String::new(),
+            };
+            Robot { context, key, speaker }
+        }
+
+        async fn says(
+            &self,
+            estop: Option<EStopStatus>,
+            is_newest: impl Fn() -> bool,
+        ) -> Result<Box<str>, NodeError> {
+            write(&self.context, &self.speaker, &report(estop), &[], is_newest).await
+        }
+
+        /// What is on the disk.
+        async fn estop(&self) -> Option<EStopStatus> {
+            self.context.store.settled().await.expect("the disk answers");
+            let stored = self.context.store.get(&self.key).expect("it is there");
+            objects::read::<Node>(&stored).and_then(|node| node.status?.estop)
+        }
+    }
+
+    #[tokio::test]
+    async fn what_seemed_to_fail_and_is_there_all_the_same_is_not_what_stands_at_the_end() {
+        let (store, failures) = memory::start_failing().await;
+        let dir = tempfile::tempdir().expect("a directory");
+        let robot = Robot::new(dir.path(), store).await;
+        robot.says(cut(), || true).await.expect("the disk is well");
         // Its gate is gone for a moment; the write seems to fail, and it says anew how it is.
         failures.mislead_next(1);
-        assert!(write(&context, &speaker, &report(None), &[]).await.is_err());
-        write(&context, &speaker, &report(cut.clone()), &[]).await.expect("the disk is well");
-        context.store.settled().await.expect("the disk answers");
-        let node: Node = objects::read(&context.store.get(&key).expect("there")).expect("a Node");
-        assert_eq!(node.status.and_then(|status| status.estop), cut);
-        drop(context);
-        writes.abort();
+        assert!(robot.says(None, || true).await.is_err());
+        robot.says(cut(), || true).await.expect("the disk is well");
+        assert_eq!(robot.estop().await, cut());
+    }
+
+    #[tokio::test]
+    async fn what_an_earlier_session_still_writes_is_not_what_stands_at_the_end() {
+        let dir = tempfile::tempdir().expect("a directory");
+        let robot = Robot::new(dir.path(), memory::start().await).await;
+        let store = &robot.context.store;
+        let books = objects::change(store, &robot.key, |stored, mut node: Node| {
+            node.spec.unschedulable = true;
+            Some(vec![objects::replace(stored, &node)])
+        });
+        let is_newest = AtomicBool::new(true);
+        let earlier = robot.says(None, || is_newest.load(Ordering::Relaxed));
+        let (mut books, mut earlier) = (pin!(books), pin!(earlier));
+        assert!(futures::poll!(&mut books).is_pending(), "it is queued");
+        assert!(futures::poll!(&mut earlier).is_pending(), "and this behind it");
+        is_newest.store(false, Ordering::Relaxed);
+        robot.says(cut(), || true).await.expect("the disk is well");
+        books.await.expect("it was first");
+        let said = earlier.await;
+        assert!(matches!(said, Err(NodeError::Replaced { .. })), "{said:?}");
+        assert_eq!(robot.estop().await, cut());
     }
 }

@@ -98,8 +98,9 @@ impl Session {
     }
 
     async fn write_strays(&self) -> Result<(), End> {
-        let names = self.stray_names();
-        nodes::write_strays(&self.context, &self.node, &names).await.map_err(internal)
+        let (names, is_newest) =
+            (self.stray_names(), || self.sessions.is_present(&self.node, self.id));
+        nodes::write_strays(&self.context, &self.node, &names, is_newest).await.map_err(internal)
     }
 
     /// Sends what changed of the page, unless it makes a stray of something that lives.

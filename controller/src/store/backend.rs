@@ -55,6 +55,9 @@ pub enum BackendError {
     /// The rows contradict each other.
     #[error("the database is damaged: {0}")]
     Damaged(String),
+    /// Another program has the database open and reads an older state of it.
+    #[error("the database's log cannot be emptied while another program reads it")]
+    LogInUse,
     /// A Secret cannot be sealed or opened.
     #[error(transparent)]
     Sealed(#[from] super::seal::SealError),

@@ -363,6 +363,9 @@ async fn a_row_that_sqlite_refuses_fails_its_whole_batch() {
         .await;
     assert!(matches!(refused, Err(StoreError::Storage { .. })), "{refused:?}");
     assert_eq!(names(&store.list(TASKS, None)), ["kept"]);
+    store.settled().await.unwrap();
+    let log = path.with_file_name("db-wal").metadata().unwrap();
+    assert_eq!(log.len(), 0, "nothing relies on what a failed sync may have left there");
     create(&store, "after").await;
     running.shut_down().await;
     let again = Running::sqlite(&path).await;

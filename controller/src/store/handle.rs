@@ -157,7 +157,7 @@ impl Store {
     }
 
     /// Reads, changes and writes an object, again when somebody else wrote in between. `change` gets the object and
-    /// its tree and returns the new tree, or `None` to leave it as it is.
+    /// its tree and returns the new tree, or `None` to leave it as it is, which is certain then.
     ///
     /// # Errors
     /// [`StoreError::NotFound`] when there is no such object (any more), or what `change` said.
@@ -171,12 +171,16 @@ impl Store {
                 return Err(StoreError::NotFound { key: key.clone() }.into());
             };
             let changed = change(&present, present.value()).map_err(UpdateError::Refused)?;
-            let Some(value) = changed else { return Ok(present) };
-            let precondition = Precondition::revision(present.revision);
-            match self.put(key.clone(), value, precondition).await {
+            let (key, precondition) = (key.clone(), Precondition::revision(present.revision));
+            let op = match changed {
+                Some(value) => Op::Put { key, value, precondition },
+                // What was read may be older than the disk.
+                None => Op::Check { key, precondition },
+            };
+            match self.apply(vec![op]).await {
                 // Whoever came first made progress, so this ends; the next read sees at least that write.
                 Err(StoreError::Conflict { .. }) => tokio::task::yield_now().await,
-                written => return Ok(written?),
+                written => return Ok(written?.pop().unwrap_or(present)),
             }
         }
     }

@@ -191,17 +191,22 @@ pub async fn open() -> (Store, Writer, Failures) {
 
 /// An empty store in memory whose writer already runs; it ends with the last handle. For tests.
 pub async fn start() -> Store {
-    let (store, writer, _) = open().await;
+    start_failing().await.0
+}
+
+/// The same, with what makes its commits fail.
+pub async fn start_failing() -> (Store, Failures) {
+    let (store, writer, failures) = open().await;
     // Owned by the store: it ends when the last handle is dropped.
     drop(tokio::spawn(writer.run(CancellationToken::new())));
-    store
+    (store, failures)
 }
 
 #[cfg(test)]
 mod tests {
     use serde_json::json;
 
-    use super::super::{Key, Op, Precondition, Resource};
+    use super::super::{Key, Op, Precondition, Resource, Stored};
     use super::*;
 
     #[tokio::test]
@@ -225,5 +230,39 @@ mod tests {
         assert_eq!(store.revision(), revision);
         assert_eq!(store.get(&key("a")).unwrap().bytes, before.bytes);
         assert!(store.get(&key("b")).is_none());
+    }
+
+    fn object(n: u64) -> serde_json::Value {
+        json!({"metadata": {"name": "a", "uid": "a"}, "n": n})
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn what_the_disk_has_is_known_soon_also_when_nobody_writes() {
+        let (store, failures) = start_failing().await;
+        let mut watcher = store.watch_all(0).unwrap();
+        failures.mislead_next(1);
+        let key = Key::cluster(Resource::new("nodes"), "a");
+        store.create(key.clone(), object(0)).await.unwrap_err();
+        let seen = tokio::time::timeout(Duration::from_secs(60), watcher.next()).await;
+        assert_eq!(seen.expect("nobody has to write for it").unwrap().len(), 1);
+        assert!(store.get(&key).is_some());
+    }
+
+    #[tokio::test]
+    async fn an_update_leaves_as_it_is_only_what_the_disk_has() {
+        let (store, failures) = start_failing().await;
+        let key = Key::cluster(Resource::new("nodes"), "a");
+        store.create(key.clone(), object(0)).await.unwrap();
+        let set = async |n: u64| {
+            let write = |_: &Stored, value: serde_json::Value| {
+                Ok::<_, std::convert::Infallible>((value["n"] != n).then(|| object(n)))
+            };
+            store.update(&key, write).await
+        };
+        failures.mislead_next(1);
+        set(1).await.unwrap_err();
+        assert_eq!(set(0).await.unwrap().value()["n"], 0);
+        store.settled().await.unwrap();
+        assert_eq!(store.get(&key).unwrap().value()["n"], 0);
     }
 }

@@ -151,6 +151,17 @@ impl Sqlite {
         Ok(())
     }
 
+    /// Puts everything into the database itself. What stands in the log after a sync that failed may be there in the kernel's
+    /// memory alone, and later syncs pass over it: what follows it in the log would be lost with it.
+    async fn empty_log(&mut self) -> Result<(), BackendError> {
+        let checkpoint = sqlx::query("PRAGMA wal_checkpoint(TRUNCATE)");
+        let row = checkpoint.fetch_one(self.connection().await?).await?;
+        match row.try_get(0)? {
+            false => Ok(()),
+            true => Err(BackendError::LogInUse),
+        }
+    }
+
     async fn connection(&mut self) -> Result<&mut SqliteConnection, BackendError> {
         if self.connection.is_none() {
             self.connection = Some(SqliteConnection::connect_with(&self.options).await?);
@@ -239,6 +250,7 @@ impl Backend for Sqlite {
 
     fn last_revision(&mut self) -> BoxFuture<'_, Result<u64, BackendError>> {
         async move {
+            self.empty_log().await?;
             let row = sqlx::query(
                 // The newest row may be a tombstone that a compaction took.
                 "SELECT max(value, (SELECT coalesce(max(revision), 0) FROM kv)) FROM meta

@@ -4,6 +4,7 @@
 //! task changes [`State`], so admission reads it without fear of change until the commit has been published.
 
 use std::sync::{Arc, PoisonError, RwLock};
+use std::time::Duration;
 
 use muster_failpoint::{Failpoint, Step, reach};
 use tokio::sync::{mpsc, oneshot, watch};
@@ -21,6 +22,9 @@ const QUEUE: usize = 4096;
 const BATCH_OPS: usize = 1024;
 /// Bytes in one batch; bounds the text handed to the database in one statement.
 const BATCH_BYTES: usize = 8 << 20;
+/// When nobody writes, the disk is asked after so long what it has of a commit that failed: a write of which nobody knows is
+/// not to take effect at some later hour.
+const ASK_AGAIN: Duration = Duration::from_secs(1);
 /// Rows that are forgotten together, as part of some commit.
 const COMPACT_ROWS: usize = 1024;
 
@@ -85,6 +89,12 @@ impl Writer {
                 // Cancel safe: a request that was not received stays in the queue and is drained below.
                 () = stop.cancelled() => break,
                 first = self.requests.recv() => first,
+                // Cancel safe: the batch stays unsettled.
+                () = tokio::time::sleep(ASK_AGAIN), if self.unsettled.is_some() => {
+                    // Why it cannot be asked is told to whoever writes.
+                    drop(self.settle().await);
+                    continue;
+                }
             };
             let Some(first) = first else { return };
             self.round(first).await;

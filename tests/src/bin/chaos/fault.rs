@@ -6,10 +6,11 @@ use std::time::{Duration, Instant};
 use clap::ValueEnum;
 use muster_api::id::Epoch;
 use muster_api::kind::lease::Lease;
+use muster_tests::dice::Dice;
 use muster_tests::wire::Way;
 use muster_tests::{docker, kernel, wait};
 
-use crate::house::{DEADLINE, Dice, House, processes};
+use crate::house::{DEADLINE, House, processes};
 use crate::report::Report;
 use crate::{residents, witness};
 

@@ -299,32 +299,3 @@ pub(crate) fn processes(words: &[&str]) -> Vec<u32> {
     });
     found
 }
-
-/// Randomness of a seed: splitmix64.
-pub(crate) struct Dice(u64);
-
-impl Dice {
-    pub(crate) fn new(seed: u64) -> Dice {
-        Dice(seed)
-    }
-
-    pub(crate) fn below(&mut self, n: usize) -> usize {
-        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let mut z = self.0;
-        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        usize::try_from((z ^ (z >> 31)) % n.max(1) as u64).expect("below a usize")
-    }
-
-    /// From `least` to `most` milliseconds.
-    pub(crate) fn millis(&mut self, least: u64, most: u64) -> Duration {
-        let span = usize::try_from(most - least).expect("short");
-        Duration::from_millis(least + self.below(span + 1) as u64)
-    }
-
-    pub(crate) fn shuffle<T>(&mut self, all: &mut [T]) {
-        for at in (1..all.len()).rev() {
-            all.swap(at, self.below(at + 1));
-        }
-    }
-}

@@ -33,6 +33,7 @@ use std::time::{Duration, Instant};
 use clap::Parser;
 use fault::Fault;
 use house::House;
+use muster_tests::dice::Dice;
 use muster_tests::netns::Namespace;
 use report::Report;
 
@@ -71,7 +72,7 @@ async fn run(args: &Args) -> Report {
     residents::move_in(&mut house).await;
     house.settle(&mut report, None).await;
     let writer = writer::Writer::begin(&house).await;
-    let mut dice = house::Dice::new(args.seed);
+    let mut dice = Dice::new(args.seed);
     let begun = Instant::now();
     let all = if args.fault.is_empty() { Fault::ALL.to_vec() } else { args.fault.clone() };
     loop {

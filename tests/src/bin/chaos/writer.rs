@@ -14,12 +14,13 @@ use kube::api::{ListParams, Patch, PatchParams, PostParams};
 use kube::{Api, Client};
 use muster_api::kind::task::Task;
 use muster_api::phase::TaskPhase;
+use muster_tests::dice::Dice;
 use serde_json::json;
 use tokio::task::JoinHandle;
 use tokio::time::MissedTickBehavior;
 use tokio_util::sync::CancellationToken;
 
-use crate::house::{DEADLINE, Dice, House, PATIENCE};
+use crate::house::{DEADLINE, House, PATIENCE};
 use crate::report::Report;
 
 /// Between two writes.

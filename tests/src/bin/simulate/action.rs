@@ -4,7 +4,7 @@ use muster_agent_core::observed::{End, Loss};
 
 use crate::agenda::Due;
 use crate::agent::What;
-use crate::dice::Dice;
+use crate::dice::{self, Dice};
 use crate::framework::Deed;
 use crate::world::{Cast, World};
 
@@ -163,7 +163,7 @@ impl Action {
 impl World {
     /// One step: an action, a while, a look at every invariant.
     pub(crate) fn step(&mut self, step: u64) {
-        self.dice = Dice::of(self.seed, step + 1);
+        self.dice = dice::of(self.seed, step + 1);
         self.log.step = step;
         let action = Action::drawn(&mut self.dice, self.cast);
         let done = self.act(action);

@@ -211,7 +211,7 @@ impl Applications {
                     && live.len() == 2
                     && home.is_some_and(|home| live.contains(&home));
                 let alone = alone && begins_in_time(application);
-                let bears = || now - *self.beside.entry(uid.clone()).or_insert(now) < BESIDE;
+                let mut bears = || now - *self.beside.entry(uid.clone()).or_insert(now) < BESIDE;
                 let settled = matches!(part.stage, None | Some(MoveStage::Settled));
                 if twice && settled && !(alone && bears()) {
                     let (name, count) = (&part.name, live.len());

@@ -10,7 +10,7 @@ use muster_api::phase::TaskPhase;
 use crate::agenda::Due;
 use crate::agent::What;
 use crate::applications::Told;
-use crate::dice::Dice;
+use crate::dice;
 use crate::framework::Deed;
 use crate::invariant::Invariant;
 use crate::truth::Cause;
@@ -36,7 +36,7 @@ fn is_stopped(status: &NodeStatus) -> bool {
 impl World {
     /// No fault from now on; gives the world until everything has settled, and says what has not.
     pub(crate) fn settle(&mut self) {
-        self.dice = Dice::of(self.seed, u64::MAX);
+        self.dice = dice::of(self.seed, u64::MAX);
         self.log.say(self.now, format_args!("= the faults stop"));
         self.house.disk.failures().fail_next(0);
         self.house.disk.failures().mislead_next(0);

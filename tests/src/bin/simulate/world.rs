@@ -15,7 +15,7 @@ use crate::agenda::{Agenda, Due};
 use crate::agent::{Agent, Hands, What};
 use crate::applications::Told;
 use crate::controller::{Controller, House, Member, Said, Skew};
-use crate::dice::Dice;
+use crate::dice::{self, Dice};
 use crate::framework::{Deed, Framework};
 use crate::invariant::{Invariant, Violation};
 use crate::log::Log;
@@ -112,7 +112,7 @@ impl World {
         let mut world = World {
             now: 0,
             seed,
-            dice: Dice::of(seed, 0),
+            dice: dice::of(seed, 0),
             agenda: Agenda::default(),
             net: Net::new(machines.len() + PATIENCE.len()),
             frameworks: frameworks.collect(),

@@ -2,9 +2,10 @@
 //! and another try whenever it breaks.
 
 use std::collections::BTreeMap;
+use std::time::Duration;
 
 use muster_agent::assigned::decode;
-use muster_agent::report_to_wire;
+use muster_agent::{DIAL_PAUSE, report_to_wire};
 use muster_agent_core::event::Event;
 use muster_agent_core::journal::Journal;
 use muster_agent_core::plan::{self, Step};
@@ -28,9 +29,13 @@ use crate::mutation::Mutation;
 use crate::net::{Conn, Down, Up};
 
 /// First and longest pause between two tries, milliseconds.
-pub(super) const PAUSE: (u64, u64) = (50, 5_000);
+pub(super) const PAUSE: (u64, u64) = (millis(DIAL_PAUSE.0), millis(DIAL_PAUSE.1));
 /// A connection on which nothing was heard for this long is given up.
-const DEAF_AFTER: u64 = 10_000;
+const DEAF_AFTER: u64 = millis(muster_agent::DEAF_AFTER);
+
+const fn millis(time: Duration) -> u64 {
+    time.as_secs() * 1_000 + time.subsec_millis() as u64
+}
 
 /// With a planted fault: what stands by does not wait for as long as it is told.
 fn begin_soon(assignment: &mut proto::Assignment) {
