@@ -174,7 +174,7 @@ impl Agent {
             return hands.later(self.index, LOOK_EVERY, LOOK_EVERY, again);
         }
         let claim = self.kernel.claim(uid);
-        let luck = hands.dice.between(0, 59);
+        let luck = hands.dice.between(0, 59) + if hands.truth.calm { 3 } else { 0 };
         if luck == 0 {
             let (reason, message) = ("NodeError".to_owned(), "cannot fork".to_owned());
             let failure = Failure { reason, message, retry: true };
