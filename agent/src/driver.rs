@@ -102,6 +102,7 @@ impl Shared {
             token: &record.token,
             gate: gate.as_deref(),
             sensors: self.sensors.serves(&record.assignment.spec.resources.sensors),
+            ros: self.topics.ros(),
             unreserved: self.allocatable_memory.saturating_sub(others),
         };
         let id = AttemptId { uid: workload.uid.clone(), attempt: workload.attempt };

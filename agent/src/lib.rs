@@ -31,6 +31,7 @@
 //! | `link` | joining, the session, logs on request |
 //! | `node`, `capacity`, `position` | what this node is, has, and where it is |
 //! | `probe` | checks of running tasks |
+//! | `ros` | what the environment of tasks says of ROS |
 //! | `runtime`, `shim` | what runs tasks |
 
 mod app;
@@ -60,6 +61,7 @@ mod mission;
 mod node;
 mod position;
 mod probe;
+mod ros;
 mod runtime;
 mod sensor;
 pub mod shim;

@@ -1,5 +1,7 @@
 use bytes::Bytes;
 use muster_ros1::Message;
+use muster_ros1::layout::Layout;
+use muster_ros1::message::describe;
 use muster_ros1::tcpros::Header;
 use muster_ros1::wire::Wire;
 use muster_ros1::xmlrpc;
@@ -42,6 +44,8 @@ fn connection_headers_are_read_as_they_are_written() {
 
 /// What decodes is encoded so that it decodes the same.
 fn there_and_back<M: Message + std::fmt::Debug>(bytes: &Bytes) {
+    let layout = Layout::of(&describe::<M>());
+    assert_eq!(layout.check(bytes).is_ok(), M::decode(bytes.clone()).is_ok(), "{}", M::TYPE);
     if let Ok(message) = M::decode(bytes.clone()) {
         let again = M::decode(message.encode().into()).expect("it is one of ours");
         assert_eq!(format!("{again:?}"), format!("{message:?}"), "{}", M::TYPE);
