@@ -8,6 +8,7 @@
 //! | [`name`], [`mod@env`] | graph names, namespaces, remapping; what `ROS_…` variables say |
 //! | [`xmlrpc`] | values, calls, answers; the client's and the server's side over HTTP |
 //! | [`master`] | the master's API |
+//! | [`registry`], [`roscore`] | a master: its state, and the server |
 //! | [`tcpros`] | connection headers, frames |
 //! | [`node`] | a node: its slave API, its registrations, its subscriptions and publications |
 //! | [`peer`] | what other nodes say of themselves |
@@ -33,6 +34,8 @@ pub mod node;
 pub mod peer;
 mod queue;
 pub mod rate;
+pub mod registry;
+pub mod roscore;
 pub mod tcpros;
 pub mod time;
 pub mod wire;

@@ -2,6 +2,7 @@ use bytes::Bytes;
 use muster_ros1::Message;
 use muster_ros1::layout::Layout;
 use muster_ros1::message::describe;
+use muster_ros1::registry::Registry;
 use muster_ros1::tcpros::Header;
 use muster_ros1::wire::Wire;
 use muster_ros1::xmlrpc;
@@ -22,6 +23,19 @@ fn calls_and_answers_are_read_as_they_are_written() {
         if let Ok(once) = answer(&text) {
             assert_eq!(answer(&once), Ok(once));
         }
+    });
+}
+
+#[test]
+fn a_master_answers_whatever_is_said() {
+    let inputs = muster_hostile::inputs("xmlrpc");
+    muster_hostile::feed(bolero::check!(), inputs, |bytes| {
+        let Ok(call) = xmlrpc::call(&String::from_utf8_lossy(bytes)) else { return };
+        let mut master = Registry::new("http://127.0.0.1:11311/", 1);
+        let first = master.handle(&call);
+        // Whoever it was, others are answered still.
+        let state = xmlrpc::Call { method: "getSystemState".into(), params: vec!["/x".into()] };
+        assert!(master.handle(&state).answer.is_ok(), "{first:?}");
     });
 }
 
