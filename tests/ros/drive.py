@@ -1,6 +1,6 @@
 #!/usr/bin/env python3
-"""Drives through the gate, twenty times a second, as fast as its argument says; prints each answer that is another than the
-one before."""
+"""Drives through the gate, as fast as its first argument says and as many times a second as its second; prints each answer that is
+another than the one before."""
 
 import json
 import sys
@@ -18,7 +18,7 @@ while True:
                 if verdict is not before:
                     print(verdict.name, flush=True)
                 before = verdict
-                time.sleep(0.05)
+                time.sleep(1 / float(sys.argv[2]))
     except muster.Disconnected as error:
         print(f"gone: {error}", file=sys.stderr, flush=True)
         time.sleep(0.05)

@@ -1,4 +1,6 @@
-"""A robot's driver: subscribes /cmd_vel and prints what it is told, `X CALLER`, X the velocity ahead."""
+"""A robot's driver: subscribes /cmd_vel, or its argument, and prints what it is told, `X CALLER`, X the velocity ahead."""
+import sys
+
 import rospy
 from geometry_msgs.msg import Twist
 
@@ -8,5 +10,5 @@ def drive(twist):
 
 
 rospy.init_node("base_driver")
-rospy.Subscriber("/cmd_vel", Twist, drive)
+rospy.Subscriber(sys.argv[1] if len(sys.argv) > 1 else "/cmd_vel", Twist, drive)
 rospy.spin()

@@ -2,10 +2,14 @@
 
 push NODE TOPIC     publishes a Twist, unknown to the master, and tells NODE that this is who publishes it
 end NODE            wants NODE to end
-evict NODE          registers with NODE's name"""
+evict NODE          registers with NODE's name
+lend NODE TOPIC     reads TOPIC in NODE's name"""
 import os
+import socket
+import struct
 import sys
 import threading
+import time
 from xmlrpc.client import ServerProxy
 from xmlrpc.server import SimpleXMLRPCServer
 
@@ -14,6 +18,8 @@ from geometry_msgs.msg import Twist
 
 what, node = sys.argv[1:3]
 master = ServerProxy(os.environ["ROS_MASTER_URI"])
+while master.lookupNode("/intruder", node)[0] != 1:
+    time.sleep(0.05)
 slave = ServerProxy(master.lookupNode("/intruder", node)[2])
 if what == "push":
     topic = sys.argv[3]
@@ -26,6 +32,20 @@ if what == "push":
     others = [master.lookupNode("/intruder", name)[2] for name in known]
     print(slave.publisherUpdate("/master", topic, others + [api])[0], flush=True)
     rospy.spin()
+elif what == "lend":
+    publishers = []
+    while not publishers:
+        time.sleep(0.05)
+        publishers = dict(master.getSystemState("/intruder")[2][0]).get(sys.argv[3], [])
+    publisher = ServerProxy(master.lookupNode("/intruder", publishers[0])[2])
+    _, host, port = publisher.requestTopic(node, sys.argv[3], [["TCPROS"]])[2]
+    fields = [f"callerid={node}", f"topic={sys.argv[3]}", "type=geometry_msgs/Twist", "md5sum=*"]
+    header = b"".join(struct.pack("<I", len(field)) + field.encode() for field in fields)
+    stream = socket.create_connection((host, port))
+    stream.sendall(struct.pack("<I", len(header)) + header)
+    print(1, flush=True)
+    while stream.recv(4096):
+        pass
 elif what == "end":
     print(slave.shutdown("/master", "for a test")[0], flush=True)
 else:

@@ -49,12 +49,13 @@ impl To {
         }
     }
 
-    /// Whether the driver may be given another command.
+    /// Whether the driver may be given another command. Where it is not known which subscriber that is, the slowest of those who
+    /// watch does not hold it up.
     pub(super) fn takes_more(&self) -> bool {
-        self.waiting == Waiting::Newest || self.is_read()
+        self.is_read() || self.driver.is_none() && self.waiting == Waiting::Newest
     }
 
-    /// Whether the driver's machine has everything; what its program has read, nobody tells.
+    /// Whether the driver has everything; of one on another machine: whether that has.
     pub(super) fn is_read(&self) -> bool {
         self.publisher.is_delivered(self.driver.as_deref())
     }
@@ -100,6 +101,7 @@ pub(super) async fn reach(
         queue: if waiting == Waiting::Each { EACH } else { 1 },
         latch: false,
         greeting: Some(stop),
+        paced: true,
     };
     let of = (*layout.description()).into();
     let publisher = node.advertise_any(&settings.topic, of, options);
@@ -211,14 +213,19 @@ impl End {
     }
 
     /// The publishers of the topic that a node reads, beside this one. The master need not know them: a node reads whom it
-    /// was told to.
+    /// was told to. One that does not read from this one has only lent its name to whoever does.
     async fn others_of(&self, reader: &str) -> Result<Vec<String>, String> {
         let uri = self.node.master().lookup_node(reader).await.map_err(|e| chain(&e))?;
         let uri: Uri = uri.parse().map_err(|error| chain(&error))?;
         let links = peer::links(&uri, self.node.name()).await.map_err(|e| chain(&e))?;
         let ours = |peer: &str| peer.parse().is_ok_and(|peer: Uri| peer == *self.node.api());
-        let others = links.into_iter().filter(|l| l.incoming && l.topic == self.topic);
-        Ok(others.map(|link| link.peer).filter(|peer| !ours(peer)).collect())
+        let read = links.into_iter().filter(|l| l.incoming && l.topic == self.topic);
+        let (ours, others): (Vec<_>, Vec<_>) =
+            read.map(|link| link.peer).partition(|peer| ours(peer));
+        match ours.is_empty() {
+            true => Err(format!("it does not read from {}", self.node.name())),
+            false => Ok(others),
+        }
     }
 
     /// Publishes no more.

@@ -7,6 +7,7 @@
 //! | `subscription` | a task a topic, and one below it for each publisher: `link` |
 //! | `publication` | a task for all who connect, and one for each subscriber |
 //! | `outbox` | what waits for one subscriber |
+//! | `unread` | what it was sent and has not read |
 //! | `bus` | every connection, for `rosnode info` |
 
 mod bus;
@@ -16,6 +17,7 @@ mod publication;
 mod registrar;
 mod slave;
 mod subscription;
+mod unread;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::io;

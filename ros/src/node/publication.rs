@@ -1,15 +1,13 @@
 //! Publications: one port for all of a node's topics, a task a subscriber. A subscriber that does not keep up loses its
 //! own oldest messages, and holds nobody up.
 
-use std::io;
 use std::marker::PhantomData;
-use std::os::fd::AsFd as _;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, Weak};
 use std::time::Duration;
 
 use bytes::Bytes;
-use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
+use tokio::io::AsyncWriteExt as _;
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::{Semaphore, watch};
 use tokio::task::JoinSet;
@@ -25,8 +23,6 @@ use crate::tcpros::{Header, LARGEST_HEADER, length, read_frame};
 const MOST: usize = 256;
 /// For a subscriber's header.
 const PATIENCE: Duration = Duration::from_secs(10);
-/// A subscriber that reads nothing for this long is gone, or frozen: it may connect again.
-const STALLED: Duration = Duration::from_secs(30);
 
 /// How a topic is published.
 #[derive(Debug, Clone)]
@@ -37,11 +33,14 @@ pub struct PublishOptions {
     pub latch: bool,
     /// Who connects is given this serialised message first.
     pub greeting: Option<Bytes>,
+    /// A subscriber is given a message when it has read those before, as far as that is known ([`Publisher::is_delivered`]): what
+    /// waits for a slow one gives way to what is newer, and to what goes first.
+    pub paced: bool,
 }
 
 impl Default for PublishOptions {
     fn default() -> Self {
-        PublishOptions { queue: 10, latch: false, greeting: None }
+        PublishOptions { queue: 10, latch: false, greeting: None, paced: false }
     }
 }
 
@@ -100,9 +99,8 @@ impl Publication {
     }
 
     /// What waits for a subscriber, with the messages in it that come first.
-    fn join(self: &Arc<Self>, caller: &str, stream: &TcpStream) -> io::Result<Joined> {
-        let socket = stream.as_fd().try_clone_to_owned()?;
-        let outbox = Arc::new(Outbox::new(self.options.queue, socket));
+    fn join(self: &Arc<Self>, caller: &str, stream: TcpStream) -> Joined {
+        let outbox = Arc::new(Outbox::new(stream, self.options.queue, self.options.paced));
         let mut readers = lock(&self.readers);
         if let Some(greeting) = &self.options.greeting {
             outbox.push_urgent(framed(greeting));
@@ -114,7 +112,7 @@ impl Publication {
         readers.all.push(Reader { caller: caller.clone(), outbox: Arc::downgrade(&outbox) });
         // While the list is held: who counts the callers misses nobody who is in it.
         self.callers.send_modify(|callers| callers.push(caller.clone()));
-        Ok(Joined { outbox, caller, publication: Arc::clone(self) })
+        Joined { outbox, caller, publication: Arc::clone(self) }
     }
 
     /// Gives a frame to all who are connected.
@@ -230,26 +228,10 @@ async fn attend(mut stream: TcpStream, shared: &Shared) {
         return;
     }
     connection.set_connected(true);
-    let Ok(joined) = publication.join(caller, &stream) else { return };
-    let (mut from, mut to) = stream.split();
-    let write = async {
-        loop {
-            let (number, frame) = joined.outbox.pop().await;
-            match tokio::time::timeout(STALLED, to.write_all(&frame)).await {
-                Ok(Ok(())) => connection.passed(frame.len()),
-                _ => return,
-            }
-            joined.outbox.wrote(number);
-        }
-    };
-    // Subscribers say nothing: what comes is their end.
-    let closed = async {
-        let mut nothing = [0; 64];
-        while from.read(&mut nothing).await.is_ok_and(|read| read > 0) {}
-    };
+    let joined = publication.join(caller, stream);
     tokio::select! {
-        () = write => {}
-        () = closed => {}
+        () = joined.outbox.send(|length| connection.passed(length)) => {}
+        () = joined.outbox.closed() => {}
         () = publication.closed.cancelled() => {}
     }
 }
@@ -317,8 +299,8 @@ impl Publisher<Bytes> {
         self.publication.send(&framed(body), true);
     }
 
-    /// Whether the machines of those who are connected, or of `only` that one, have everything. What the programs have read is
-    /// not known.
+    /// Whether those who are connected, or `only` that one, have everything: on this machine and in its network the program, of
+    /// one elsewhere its machine; what a program there has read is not known.
     #[must_use]
     pub fn is_delivered(&self, only: Option<&str>) -> bool {
         let readers = lock(&self.publication.readers);

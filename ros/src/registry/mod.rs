@@ -287,8 +287,9 @@ impl Registry {
 
     /// A publisher's type goes before a subscriber's; `*` is any.
     fn set_type(&mut self, topic: &str, kind: &str, publishes: bool) {
-        let known = self.types.contains_key(topic);
-        if known && !(publishes && kind != "*") || !known && kind == "*" && !publishes {
+        let (known, any) = (self.types.contains_key(topic), kind == "*");
+        let sets = if publishes { !known || !any } else { !known && !any };
+        if !sets {
             return;
         }
         if !known && self.types.len() >= TYPES {

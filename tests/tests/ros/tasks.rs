@@ -1,6 +1,6 @@
 //! Tasks whose environment says where ROS is: nodes that roslaunch starts are in the robot's graph.
 
-use muster_tests::{AgentOptions, Cluster, Ros, wait};
+use muster_tests::{AgentOptions, Cluster, Ros, kernel, wait};
 use serde_json::{Value, json};
 
 /// Starts a node and sets a parameter, both with relative names.
@@ -50,16 +50,17 @@ async fn there(ros: &Ros, namespace: &str) {
 async fn what_roslaunch_starts_is_in_the_robots_graph() {
     let ros = Ros::start().await;
     let cluster = one_robot(&ros).await;
-    cluster.create("patrol", launches(&ros, json!({"namespace": "/patrol"}))).await;
+    let patrol = cluster.create("patrol", launches(&ros, json!({"namespace": "/patrol"}))).await;
     there(&ros, "/patrol").await;
     // Where nothing is said of a namespace it is the agent's; and a master may be named.
     cluster.create("other", launches(&ros, json!({"master": ros.master()}))).await;
     there(&ros, "/robot").await;
-    // It ends in order: roslaunch ends its nodes, and they take their leave.
+    // All of it ends, and nothing of the other.
     cluster.delete("patrol").await;
-    wait::until("the node's end", async || {
-        let nodes = ros.output("rosnode", &["list"]).await;
-        if nodes.contains("/patrol/logger") { Err(nodes) } else { Ok(()) }
+    let uid = patrol.metadata.uid.expect("set by the server");
+    wait::until("its nodes' end", async || {
+        let left = kernel::with_env("MUSTER_UID", &uid);
+        if left.is_empty() { Ok(()) } else { Err(format!("{left:?}")) }
     })
     .await;
     there(&ros, "/robot").await;
