@@ -33,6 +33,7 @@
 //! | `probe` | checks of running tasks |
 //! | `ros` | what the environment of tasks says of ROS |
 //! | `runtime`, `shim` | what runs tasks |
+//! | `view` | a ROS master for one task alone, and what it sees of the robot in it |
 
 mod app;
 pub mod assigned;
@@ -70,6 +71,7 @@ mod socket;
 mod spec;
 mod supervisor;
 mod told;
+mod view;
 
 pub use app::{AgentError, run, serve};
 pub use link::dial::{DEAF_AFTER, PAUSE as DIAL_PAUSE};

@@ -1,6 +1,6 @@
 //! What this node knows of ROS 1, for tasks: those that say nothing of it are given nothing.
 
-use std::net::{IpAddr, SocketAddr};
+use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 
 use muster_api::kind::task::RosSpec;
 use muster_ros1::env::{DEFAULT_MASTER, Environment, address_towards};
@@ -8,6 +8,9 @@ use muster_ros1::xmlrpc::http::Uri;
 
 use crate::config::Config;
 use crate::position::PositionSource;
+
+/// Where the master of a task's view is, on its own loopback: ROS's default.
+pub(crate) const VIEW_PORT: u16 = 11311;
 
 /// By the agent's flags, then its environment.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
@@ -39,9 +42,15 @@ impl Ros {
         task: &RosSpec,
         in_our_network: bool,
     ) -> impl Iterator<Item = (String, String)> {
-        let master = task.uri().or(self.master.as_deref()).unwrap_or(DEFAULT_MASTER).to_owned();
-        let host = in_our_network.then(|| self.host.clone().or_else(|| own_address(&master)));
-        let host = host.flatten().map(|host| match host.parse::<IpAddr>() {
+        let (master, host) = if task.is_view() {
+            let loopback = Ipv4Addr::LOCALHOST.to_string();
+            (format!("http://{loopback}:{VIEW_PORT}"), Some(loopback))
+        } else {
+            let master = task.uri().or(self.master.as_deref()).unwrap_or(DEFAULT_MASTER).to_owned();
+            let host = in_our_network.then(|| self.host.clone().or_else(|| own_address(&master)));
+            (master, host.flatten())
+        };
+        let host = host.map(|host| match host.parse::<IpAddr>() {
             Ok(_) => ("ROS_IP", host),
             Err(_) => ("ROS_HOSTNAME", host),
         });
@@ -92,6 +101,11 @@ mod tests {
         assert_eq!(
             variables(&robot, &task, true),
             ["ROS_MASTER_URI=http://127.0.0.1:5", "ROS_NAMESPACE=/t", "ROS_HOSTNAME=robot"]
+        );
+        let view = RosSpec { master: "View".to_owned(), namespace: None };
+        assert_eq!(
+            variables(&robot, &view, false),
+            ["ROS_MASTER_URI=http://127.0.0.1:11311", "ROS_NAMESPACE=/r1", "ROS_IP=127.0.0.1"]
         );
     }
 }

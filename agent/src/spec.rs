@@ -204,6 +204,11 @@ fn in_our_network(run: &task::Run) -> bool {
     container && process.is_none_or(|run| run.network == task::ProcessNetwork::Host)
 }
 
+/// Whether the task has a ROS master of its own, and so a network.
+pub(crate) fn has_view(spec: &TaskSpec) -> bool {
+    spec.ros.as_ref().is_some_and(task::RosSpec::is_view)
+}
+
 fn variables(list: &[task::EnvVar]) -> BTreeMap<String, String> {
     let plain = list.iter().filter(|variable| variable.value_from.is_none());
     plain.map(|variable| (variable.name.clone(), variable.value.clone())).collect()
@@ -238,8 +243,8 @@ fn program(assignment: &Assignment) -> (Program, BTreeMap<String, String>) {
                 })
                 .collect(),
             network: match run.network {
-                task::Network::Host => Network::Host,
-                task::Network::None => Network::None,
+                task::Network::Host if !has_view(spec) => Network::Host,
+                task::Network::Host | task::Network::None => Network::None,
                 task::Network::Bridge => Network::Bridge,
             },
             run_as: run.user.clone(),
@@ -261,8 +266,8 @@ fn program(assignment: &Assignment) -> (Program, BTreeMap<String, String>) {
     let argv = run.command.iter().chain(&run.args).cloned().collect();
     let working_dir = run.working_dir.as_ref().map(PathBuf::from);
     let network = match run.network {
-        task::ProcessNetwork::Host => Network::Host,
-        task::ProcessNetwork::None => Network::None,
+        task::ProcessNetwork::Host if !has_view(spec) => Network::Host,
+        task::ProcessNetwork::Host | task::ProcessNetwork::None => Network::None,
     };
     let program = Program::Process { argv, working_dir, user: run.user.clone(), network };
     (program, variables(&run.env))

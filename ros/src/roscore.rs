@@ -18,10 +18,13 @@ use tokio_util::task::AbortOnDropHandle;
 
 use crate::registry::{Notice, Registry, Response};
 use crate::xmlrpc::http::{Handler, Uri, invoke, serve};
-use crate::xmlrpc::{Answer, Call, Value};
+use crate::xmlrpc::{self, Answer, Call, Fault, Value, write_call};
 
 /// Nodes that are told something at once. Each has seconds to answer.
 const AT_ONCE: usize = 64;
+
+/// Keeps what a master knows, before those who told it are answered. What is not kept is not answered as done.
+pub type Save = Box<dyn Fn(&str) -> io::Result<()> + Send + Sync>;
 
 /// A running master. When it is dropped, nobody answers any more.
 #[derive(Debug)]
@@ -31,11 +34,17 @@ pub struct Roscore {
     _tasks: [AbortOnDropHandle<()>; 2],
 }
 
-#[derive(Debug)]
 struct State {
     registry: Mutex<Registry>,
+    save: Option<Save>,
     outgoing: Mutex<BTreeMap<String, VecDeque<Notice>>>,
     some: Notify,
+}
+
+impl std::fmt::Debug for State {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("State").field("registry", &self.registry).finish_non_exhaustive()
+    }
 }
 
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
@@ -50,10 +59,42 @@ impl Roscore {
     ///
     /// The listener has no address.
     pub fn start(listener: TcpListener, host: &str) -> io::Result<Roscore> {
+        Roscore::begin(listener, host, |_| {}, None)
+    }
+
+    /// Goes on with what an earlier one knew, as that was last saved; what cannot be read is nothing.
+    ///
+    /// # Errors
+    ///
+    /// As [`Roscore::start`].
+    pub fn resume(
+        listener: TcpListener,
+        host: &str,
+        known: &str,
+        save: Save,
+    ) -> io::Result<Roscore> {
+        let learn = |registry: &mut Registry| match xmlrpc::call(known) {
+            // Whoever is named in it was told of it by the earlier one.
+            Ok(recital) => drop(registry.handle(&recital)),
+            Err(error) if known.is_empty() => tracing::debug!(%error, "a new master"),
+            Err(error) => tracing::warn!(%error, "what a ROS master knew cannot be read"),
+        };
+        Roscore::begin(listener, host, learn, Some(save))
+    }
+
+    fn begin(
+        listener: TcpListener,
+        host: &str,
+        learn: impl FnOnce(&mut Registry),
+        save: Option<Save>,
+    ) -> io::Result<Roscore> {
         let uri = Uri { host: host.to_owned(), port: listener.local_addr()?.port() };
         let pid = i32::try_from(std::process::id()).unwrap_or(i32::MAX);
+        let mut registry = Registry::new(&uri.to_string(), pid);
+        learn(&mut registry);
         let state = Arc::new(State {
-            registry: Mutex::new(Registry::new(&uri.to_string(), pid)),
+            registry: Mutex::new(registry),
+            save,
             outgoing: Mutex::default(),
             some: Notify::new(),
         });
@@ -79,7 +120,15 @@ impl Handler for State {
     fn handle(&self, call: Call) -> Answer {
         // Held together: notices are queued in the order in which what they tell came about.
         let mut registry = lock(&self.registry);
-        let Response { answer, notices } = registry.handle(&call);
+        let Response { mut answer, notices } = registry.handle(&call);
+        if let Some(save) = self.save.as_ref().filter(|_| changes(&call.method)) {
+            let Call { method, params } = registry.recital();
+            if let Err(error) = save(&write_call(&method, &params)) {
+                tracing::warn!(%error, "what a ROS master knows cannot be kept");
+                answer =
+                    Err(Fault { code: 1, text: format!("the master cannot keep it: {error}") });
+            }
+        }
         if !notices.is_empty() {
             let mut outgoing = lock(&self.outgoing);
             notices.into_iter().for_each(|notice| queue(&mut outgoing, notice));
@@ -87,6 +136,12 @@ impl Handler for State {
         }
         answer
     }
+}
+
+/// Whether a call may change what the master knows.
+fn changes(method: &str) -> bool {
+    let asks = ["get", "has", "search", "lookup"].iter().any(|word| method.starts_with(word));
+    !asks && method != "shutdown"
 }
 
 /// One that waits and is about the same is out of date.

@@ -24,6 +24,7 @@ use crate::driver::chain;
 use crate::durable::{self, FileError, Keep};
 use crate::executor::frame;
 use crate::runtime::process::Reexec;
+use crate::view::Actuator;
 
 /// The agent says what it wants at least so often; see `hall`'s `STUCK`.
 const SAY_EVERY: Duration = Duration::from_secs(1);
@@ -57,6 +58,12 @@ impl Keeper {
             newest: watch::Sender::default(),
             standing: watch::Sender::default(),
         }
+    }
+
+    /// The drivers that are topics of ROS's.
+    pub(crate) fn topics(&self) -> Vec<Actuator> {
+        let actuator = |(topic, actuator)| Actuator { topic, actuator };
+        self.setup.topics().map(actuator).collect()
     }
 
     /// Where tasks find their socket.

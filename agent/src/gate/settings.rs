@@ -353,6 +353,17 @@ impl Settings {
     }
 }
 
+impl Setup {
+    /// The drivers that are topics: the topic's global name, and an actuator that it moves.
+    pub(crate) fn topics(&self) -> impl Iterator<Item = (String, String)> {
+        let names = Resolver::new(self.ros.namespace.as_deref().unwrap_or("/"), "gate", []).ok();
+        self.settings.drivers.iter().filter_map(move |driver| {
+            let topic = names.as_ref()?.resolve(&driver.ros1.as_ref()?.topic).ok()?;
+            Some((topic, driver.actuators.first()?.to_string()))
+        })
+    }
+}
+
 impl Ros {
     /// What is not said is the environment's, as ROS has it.
     fn of(pose: &PoseSettings, robot: &str) -> Ros {

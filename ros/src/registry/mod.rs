@@ -7,6 +7,7 @@
 //! what is theirs.
 
 mod params;
+mod recital;
 mod said;
 
 use std::collections::{BTreeMap, BTreeSet};

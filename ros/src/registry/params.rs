@@ -4,6 +4,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
+use super::said::path;
 use crate::xmlrpc::Value;
 
 /// All parameters together, roughly, bytes.
@@ -158,6 +159,18 @@ impl Params {
             followers.retain(|(name, _)| name != node);
             !followers.is_empty()
         });
+    }
+
+    /// Everybody who follows something: name, address, and the key.
+    pub(super) fn followers(&self) -> impl Iterator<Item = (&str, &str, String)> {
+        self.followers.iter().flat_map(|(key, followers)| {
+            followers.iter().map(|(node, api)| (&**node, &**api, path(key)))
+        })
+    }
+
+    /// Everything that is set.
+    pub(super) fn all(&self) -> Value {
+        dictionary(&self.root)
     }
 
     pub(super) fn follows(&self, node: &str) -> usize {

@@ -1,6 +1,7 @@
 use proptest::prelude::*;
 
 use super::*;
+use crate::xmlrpc::{self, write_call};
 
 const URI: &str = "http://127.0.0.1:11311/";
 
@@ -104,6 +105,33 @@ fn what_is_kept_is_nobody_elses() {
     assert!(ask(&mut master, "shutdown", &["/x", "bye"]).0.is_err());
 }
 
+/// One that goes on where `master` ended.
+fn next(master: &Registry) -> Registry {
+    let Call { method, params } = master.recital();
+    let recital = xmlrpc::call(&write_call(&method, &params)).unwrap();
+    let mut next = Registry::new(URI, 2);
+    next.handle(&recital).answer.unwrap();
+    next
+}
+
+#[test]
+fn the_next_master_knows_what_the_one_before_knew() {
+    let mut master = Registry::new(URI, 1);
+    master.keep("/muster", "http://m:1/");
+    ask(&mut master, "registerPublisher", &["/muster", "/scan", "a/B", "http://m:1/"]).0.unwrap();
+    ask(&mut master, "registerService", &["/n", "/n/do", "rosrpc://n:2", "http://n:1/"]).0.unwrap();
+    ask(&mut master, "subscribeParam", &["/f", "http://f:1/", "/gains"]).0.unwrap();
+    call(&mut master, "setParam", &["/n".into(), "/gains/p".into(), 2.into()]).0.unwrap();
+    let mut next = next(&master);
+    assert_eq!(next.services, master.services);
+    assert_eq!(ask(&mut next, "getParam", &["/x", "/gains/p"]).0, Ok(2.into()));
+    assert_eq!(call(&mut next, "setParam", &["/n".into(), "/gains/p".into(), 3.into()]).1.len(), 1);
+    assert!(
+        !next.nodes.contains_key("/muster") && next.publishers.is_empty(),
+        "it comes by itself"
+    );
+}
+
 #[test]
 fn parameters_are_in_the_callers_namespace_and_followed() {
     let mut master = Registry::new(URI, 1);
@@ -192,6 +220,10 @@ proptest! {
                 prop_assert!(has(&master.publishers, name) || has(&master.subscribers, name));
             }
         }
+        let next = next(&master);
+        prop_assert_eq!(&next.publishers, &master.publishers);
+        prop_assert_eq!(&next.subscribers, &master.subscribers);
+        prop_assert_eq!(&next.nodes, &master.nodes);
     }
 
     /// Whatever is said, it is answered.

@@ -4,35 +4,17 @@
 use muster_ros1::xmlrpc::Value as Said;
 use muster_ros1::xmlrpc::http::{Uri, invoke};
 use muster_tests::ros::Program;
+use muster_tests::ros_robot::{self, GATE, address, attacks, drives};
 use muster_tests::{Cluster, Ros, wait};
-use serde_json::{Value, json};
+use serde_json::json;
 
-use crate::gate::{GATE, drives, drives_at, fenced, robot, told};
-
-const SCRIPT: &str = include_str!("../../ros/attack.py");
+use crate::gate::{fenced, told};
 
 /// Tricks that are tried.
 const TRIES: &str = "10000";
 
-/// An address from a line of `rosnode info`, as `contacting node http://127.0.0.1:4711/ ...`.
-async fn address(ros: &Ros, node: &str) -> String {
-    let info = ros.output("rosnode", &["info", node]).await;
-    let line = info.lines().find_map(|line| line.strip_prefix("contacting node "));
-    let address = line.and_then(|line| line.split_whitespace().next());
-    address.unwrap_or_else(|| panic!("{info}")).to_owned()
-}
-
-async fn attacks(ros: &Ros, tries: &str, network: &str) -> Value {
-    let (driver, gate) = (address(ros, "/base_driver").await, address(ros, GATE).await);
-    // As text: another user may not see this tree.
-    let command = json!(["/usr/bin/python3", "-c", SCRIPT, ros.master(), driver, gate, tries]);
-    json!({
-        "run": {"process": {
-            "command": command, "user": "65534", "network": network, "workingDir": "/",
-        }},
-        "gracePeriodSeconds": 0,
-    })
-}
+/// The same by a task that has a ROS master of its own.
+const FEWER: &str = "1000";
 
 /// Waits for what an attacker says in the end: how many of its tries were answered.
 async fn reached(cluster: &Cluster, task: &str, tries: &str) -> u64 {
@@ -44,33 +26,40 @@ async fn reached(cluster: &Cluster, task: &str, tries: &str) -> u64 {
     said.await
 }
 
-/// The next so many words of the driver's are this speed, and the gate's.
+/// The driver hears this speed so many times more, and nothing else but a stop, which the gate gives when the agent cannot speak
+/// for seconds, as on a machine that is too busy.
 async fn drives_on(driver: &mut Program, speed: &str, times: usize) {
-    for _ in 0..times {
+    let (moves, stands) = (format!("{speed} {GATE}"), format!("0.0 {GATE}"));
+    let mut heard = 0;
+    while heard < times {
         let line = driver.line().await;
-        assert_eq!(line, format!("{speed} {GATE}"));
+        assert!(line == moves || line == stands, "{line}");
+        heard += usize::from(line == moves);
     }
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn who_does_not_hold_the_robot_gets_nothing_through() {
     let ros = Ros::start().await;
-    let cluster = robot(&ros).await;
+    let cluster = ros_robot::join(&ros, json!({})).await;
     let mut driver = ros.script("driver.py", &[]);
     fenced(&cluster, "True", "").await;
-    cluster.create("holder", drives("0.25")).await;
+    cluster.create("holder", drives("0.25", "20")).await;
     told(&mut driver, "0.25").await;
     cluster.create("attacker", attacks(&ros, TRIES, "None").await).await;
-    // Every word of these is the holder's, and none is a stop.
+    let mut viewer = attacks(&ros, FEWER, "Host").await;
+    viewer["ros"] = json!({"master": "View"});
+    cluster.create("viewer", viewer).await;
     drives_on(&mut driver, "0.25", 40).await;
     assert_eq!(reached(&cluster, "attacker", TRIES).await, 0);
+    assert_eq!(reached(&cluster, "viewer", FEWER).await, 0);
     drives_on(&mut driver, "0.25", 10).await;
     fenced(&cluster, "True", "").await;
     // The holder too has no other way than the gate.
     cluster.delete("attacker").await;
     cluster.delete("holder").await;
     told(&mut driver, "0.0").await;
-    let mut alone = drives("0.5");
+    let mut alone = drives("0.5", "20");
     alone["run"]["process"]["network"] = "None".into();
     cluster.create("alone", alone).await;
     told(&mut driver, "0.5").await;
@@ -95,7 +84,7 @@ async fn given(gate: &Uri) -> usize {
 #[tokio::test(flavor = "multi_thread")]
 async fn whoever_lost_the_robot_gets_nothing_through_from_the_reply_on() {
     let ros = Ros::start().await;
-    let cluster = robot(&ros).await;
+    let cluster = ros_robot::join(&ros, json!({})).await;
     let mut driver = ros.script("driver.py", &[]);
     fenced(&cluster, "True", "").await;
     let gate: Uri = address(&ros, GATE).await.parse().expect("an address");
@@ -103,7 +92,7 @@ async fn whoever_lost_the_robot_gets_nothing_through_from_the_reply_on() {
     let mut heard = 0;
     for speed in ["0.25", "0.5", "0.75"] {
         let before = format!("holder-{heard}");
-        cluster.create(&before, drives_at(speed, "200")).await;
+        cluster.create(&before, drives(speed, "200")).await;
         let (moves, stands) = (format!("{speed} {GATE}"), format!("0.0 {GATE}"));
         let mut line = driver.line().await;
         heard += 1;

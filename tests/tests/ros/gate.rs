@@ -2,28 +2,10 @@
 
 use muster_api::kind::node::Node;
 use muster_api::phase::TaskPhase;
-use muster_tests::puppet::python;
 use muster_tests::ros::Program;
-use muster_tests::{AgentOptions, Cluster, Ros, kernel, wait};
+use muster_tests::ros_robot::{self, GATE, gate_pid};
+use muster_tests::{Cluster, Ros, kernel, wait};
 use serde_json::{Value, json};
-
-pub(crate) const GATE: &str = "/muster_gate_robot_cmd_vel";
-
-/// Silence stops it only after minutes: what it is told in a test does not hang on how busy the machine is.
-pub(crate) async fn robot(ros: &Ros) -> Cluster {
-    let mut cluster = Cluster::start().await;
-    let config = cluster.dir().join("agent.yaml");
-    let gate = json!({"arRes": "base:Drive", "gate": {"drivers": [{
-        "actuators": ["base:Drive"],
-        "ros1": {"topic": "/cmd_vel", "type": "geometry_msgs/Twist", "node": "/base_driver"},
-    }], "ladder": [{"after": "5m", "action": "Stop"}]}});
-    // JSON is YAML.
-    std::fs::write(&config, gate.to_string()).expect("a directory");
-    let robot = AgentOptions::bare("robot").flag("--kind", "robot").flag("--docker-socket", "none");
-    let robot = robot.flag("--ros-host", "127.0.0.1").flag("--ros-master", &ros.master());
-    cluster.join(robot.flag("--config", &config.display().to_string())).await;
-    cluster
-}
 
 /// Waits until the node says this of its actuators.
 pub(crate) async fn fenced(cluster: &Cluster, status: &str, words: &str) {
@@ -38,17 +20,8 @@ pub(crate) async fn fenced(cluster: &Cluster, status: &str, words: &str) {
     wait::object(cluster.nodes().await, "robot", words, told).await;
 }
 
-pub(crate) fn drives(speed: &str) -> Value {
-    drives_at(speed, "20")
-}
-
-pub(crate) fn drives_at(speed: &str, hertz: &str) -> Value {
-    let script = concat!(env!("CARGO_MANIFEST_DIR"), "/ros/drive.py");
-    json!({
-        "resources": {"actuators": ["base:Drive"]},
-        "run": {"process": {"command": [python(), script, speed, hertz]}},
-        "gracePeriodSeconds": 0,
-    })
+fn drives(speed: &str) -> Value {
+    ros_robot::drives(speed, "20")
 }
 
 /// Reads on until the driver is told `speed`; all of it is the gate's word.
@@ -63,16 +36,10 @@ pub(crate) async fn told(driver: &mut Program, speed: &str) {
     }
 }
 
-pub(crate) fn gate_pid(cluster: &Cluster) -> u32 {
-    let lock = cluster.dir().join("robot/gate/lock");
-    let pid = std::fs::read_to_string(lock).expect("a gate runs");
-    pid.trim().parse().expect("its pid")
-}
-
 #[tokio::test(flavor = "multi_thread")]
 async fn a_topic_is_driven_by_the_holder_and_begins_with_a_stop() {
     let ros = Ros::start().await;
-    let cluster = robot(&ros).await;
+    let cluster = ros_robot::join(&ros, json!({})).await;
     fenced(&cluster, "False", "/base_driver does not subscribe /cmd_vel").await;
     let mut driver = ros.script("driver.py", &[]);
     assert_eq!(driver.line().await, format!("0.0 {GATE}"));
@@ -109,7 +76,7 @@ async fn a_topic_is_driven_by_the_holder_and_begins_with_a_stop() {
 #[tokio::test(flavor = "multi_thread")]
 async fn a_gate_is_not_ended_and_tells_of_others_who_command() {
     let ros = Ros::start().await;
-    let cluster = robot(&ros).await;
+    let cluster = ros_robot::join(&ros, json!({})).await;
     // Somebody reads in the name of the driver, which is there and does not.
     let mut asleep = ros.script("driver.py", &["/elsewhere"]);
     let mut lend = ros.script("intrude.py", &["lend", "/base_driver", "/cmd_vel"]);

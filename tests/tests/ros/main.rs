@@ -8,3 +8,4 @@ mod pose;
 mod probes;
 mod sensors;
 mod tasks;
+mod view;

@@ -82,7 +82,8 @@ fn dependency(on: &DependsOn) -> String {
 /// Of a running task: whether it serves.
 fn ros(ros: &RosSpec) -> String {
     let namespace = ros.namespace.as_ref().map(|namespace| format!(", in {namespace}"));
-    let master = ros.uri().unwrap_or("the node's master");
+    let own = if ros.is_view() { "a master of its own" } else { "the node's master" };
+    let master = ros.uri().unwrap_or(own);
     format!("{master}{}", namespace.unwrap_or_default())
 }
 
