@@ -49,7 +49,8 @@ use crate::link::session::{Command, Link};
 use crate::link::token::{Token, TokenError};
 use crate::link::{Address, AddressError};
 use crate::node::{Enforced, Facts, Node};
-use crate::probe::topic::{Ros, Topics};
+use crate::probe::topic::Topics;
+use crate::ros::Ros;
 use crate::runtime::Runtime;
 use crate::runtime::cgroup::Kernel;
 use crate::runtime::cgroup::hierarchy::Version;
@@ -270,14 +271,15 @@ pub async fn serve(
         end_former(&gate_dir).await;
         None
     } else {
-        Some(Arc::new(Keeper::new(config.gate.clone(), gate_dir, &reexec)))
+        let setup = config.gate.clone().set_up(&config.pose, name.as_str());
+        Some(Arc::new(Keeper::new(setup, gate_dir, &reexec)))
     };
     let simulator = config.simulated.as_ref().map(|settings| {
         Arc::new(Simulator::new(settings, config.data_dir.join(sim::DIR), &reexec))
     });
     let desks = Arc::new(Desks::new(checkpoint.clone(), name.clone()));
     let works = WorkRuntime { desks: Arc::clone(&desks), contact: Arc::clone(&contact) };
-    let ros = Ros::new(&config, &name);
+    let topics = Arc::new(Topics::new(Ros::new(&config), &name));
     let sensors = Arc::new(Sensors::new(&config, &name));
     let shared = Arc::new(Shared {
         node: name,
@@ -288,7 +290,7 @@ pub async fn serve(
         gate: keeper.clone(),
         sensors: Arc::clone(&sensors),
         images: Images::default(),
-        topics: Arc::new(Topics::new(ros)),
+        topics,
         boot_id,
         checkpoint,
         files,

@@ -46,6 +46,7 @@ use crate::sensor;
 use crate::sensor::Sensors;
 use crate::sensor::talk::Owner;
 use crate::spec::{self, Kind, Surroundings};
+use crate::view::{Plan, View};
 
 /// Between two tries to make a record durable. Nothing else of the task happens meanwhile: a disk
 /// that is full must not lead to a second run.
@@ -102,6 +103,7 @@ impl Shared {
             token: &record.token,
             gate: gate.as_deref(),
             sensors: self.sensors.serves(&record.assignment.spec.resources.sensors),
+            ros: self.topics.ros(),
             unreserved: self.allocatable_memory.saturating_sub(others),
         };
         let id = AttemptId { uid: workload.uid.clone(), attempt: workload.attempt };
@@ -172,6 +174,8 @@ pub(crate) struct Driver {
     seat: Option<Seat>,
     /// While processes of an attempt may exist that asked for sensors.
     sensing: Option<sensor::seat::Seat>,
+    /// While processes of an attempt may exist that has a ROS master of its own.
+    view: Option<View>,
     /// While an attempt runs that has probes.
     probing: Option<Probing>,
     /// The tasks that it waits for.
@@ -244,6 +248,7 @@ pub(crate) async fn drive(
         files,
         seat: None,
         sensing: None,
+        view: None,
         probing: None,
         others,
         dropped: false,
@@ -343,7 +348,7 @@ impl Driver {
     async fn attend(&mut self) {
         self.shared.admit(&self.record);
         if !self.record.workload.state.may_be_live() {
-            (self.seat, self.sensing) = (None, None);
+            (self.seat, self.sensing, self.view) = (None, None, None);
             if self.files {
                 self.clear_files().await;
             }
@@ -394,6 +399,17 @@ impl Driver {
         }
     }
 
+    /// Serves the ROS master of an attempt that runs, until nothing of it may live.
+    fn show(&mut self) {
+        let (workload, spec) = (&self.record.workload, &self.record.assignment.spec);
+        self.view.take_if(|view| view.attempt != workload.attempt);
+        let runs = matches!(workload.state, State::Running { .. });
+        if runs && self.view.is_none() && spec::has_view(spec) {
+            let plan = Plan::of(&self.shared, &self.record);
+            self.view = Some(View::open(Arc::clone(&self.runtime), self.launch(), plan));
+        }
+    }
+
     /// Probes what runs, and nothing else. Before anything is told or ended: no check outlives its attempt.
     async fn probe(&mut self) {
         let workload = &self.record.workload;
@@ -411,6 +427,7 @@ impl Driver {
 
     async fn carry_out(&mut self, response: Response) {
         self.attend().await;
+        self.show();
         self.probe().await;
         // As checks: no client's program outlives the attempt that it was run in.
         self.shared.execs.settle(&self.record.workload).await;

@@ -31,7 +31,9 @@
 //! | `link` | joining, the session, logs on request |
 //! | `node`, `capacity`, `position` | what this node is, has, and where it is |
 //! | `probe` | checks of running tasks |
+//! | `ros` | what the environment of tasks says of ROS |
 //! | `runtime`, `shim` | what runs tasks |
+//! | `view` | a ROS master for one task alone, and what it sees of the robot in it |
 
 mod app;
 pub mod assigned;
@@ -60,6 +62,7 @@ mod mission;
 mod node;
 mod position;
 mod probe;
+mod ros;
 mod runtime;
 mod sensor;
 pub mod shim;
@@ -68,6 +71,7 @@ mod socket;
 mod spec;
 mod supervisor;
 mod told;
+mod view;
 
 pub use app::{AgentError, run, serve};
 pub use link::dial::{DEAF_AFTER, PAUSE as DIAL_PAUSE};

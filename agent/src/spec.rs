@@ -14,6 +14,7 @@ use crate::checkpoint::Assignment;
 use crate::executor;
 use crate::gate;
 use crate::probe;
+use crate::ros::Ros;
 use crate::runtime::launch::{
     AttemptId, Container, Launch, Lease, Limits, Mount, Network, Program, Pull, Work,
 };
@@ -104,6 +105,8 @@ pub(crate) struct Surroundings<'a> {
     pub(crate) gate: Option<&'a Path>,
     /// Some sensor that the task asks for has a source.
     pub(crate) sensors: bool,
+    /// Where the node's ROS is.
+    pub(crate) ros: &'a Ros,
     /// Memory that nobody reserved, bytes.
     pub(crate) unreserved: u64,
 }
@@ -189,7 +192,21 @@ fn environment(
         env.insert(sensor::DIR_ENV.to_owned(), dir);
         env.insert(sensor::TOKEN_ENV.to_owned(), around.token.to_owned());
     }
+    if let Some(ros) = &assignment.spec.ros {
+        env.extend(around.ros.variables(ros, in_our_network(&assignment.spec.run)));
+    }
     env
+}
+
+fn in_our_network(run: &task::Run) -> bool {
+    let container = run.container.as_ref().is_none_or(|run| run.network == task::Network::Host);
+    let process = run.process.as_ref();
+    container && process.is_none_or(|run| run.network == task::ProcessNetwork::Host)
+}
+
+/// Whether the task has a ROS master of its own, and so a network.
+pub(crate) fn has_view(spec: &TaskSpec) -> bool {
+    spec.ros.as_ref().is_some_and(task::RosSpec::is_view)
 }
 
 fn variables(list: &[task::EnvVar]) -> BTreeMap<String, String> {
@@ -226,8 +243,8 @@ fn program(assignment: &Assignment) -> (Program, BTreeMap<String, String>) {
                 })
                 .collect(),
             network: match run.network {
-                task::Network::Host => Network::Host,
-                task::Network::None => Network::None,
+                task::Network::Host if !has_view(spec) => Network::Host,
+                task::Network::Host | task::Network::None => Network::None,
                 task::Network::Bridge => Network::Bridge,
             },
             run_as: run.user.clone(),
@@ -238,10 +255,20 @@ fn program(assignment: &Assignment) -> (Program, BTreeMap<String, String>) {
     }
     // Admission lets neither through; an empty command fails as a start error that says so.
     let Some(run) = &spec.run.process else {
-        let none = Program::Process { argv: Vec::new(), working_dir: None, user: None };
+        let none = Program::Process {
+            argv: Vec::new(),
+            working_dir: None,
+            user: None,
+            network: Network::Host,
+        };
         return (none, BTreeMap::new());
     };
     let argv = run.command.iter().chain(&run.args).cloned().collect();
     let working_dir = run.working_dir.as_ref().map(PathBuf::from);
-    (Program::Process { argv, working_dir, user: run.user.clone() }, variables(&run.env))
+    let network = match run.network {
+        task::ProcessNetwork::Host if !has_view(spec) => Network::Host,
+        task::ProcessNetwork::Host | task::ProcessNetwork::None => Network::None,
+    };
+    let program = Program::Process { argv, working_dir, user: run.user.clone(), network };
+    (program, variables(&run.env))
 }

@@ -387,3 +387,37 @@ fn an_attempt_that_failed_its_probe_is_ended_by_the_next_life_of_the_agent() {
     let end = controller.wait_end("stuck");
     assert_eq!((end.reason.as_str(), end.signal), ("LivenessFailed", Some(9)), "{end:?}");
 }
+
+#[test]
+fn a_process_with_a_network_of_its_own_is_reached_in_it_and_reaches_nobody() {
+    let controller = Controller::start();
+    let agent = Agent::start(&controller);
+    let outside = Server::start();
+    outside.say(200);
+    // Serves on its own loopback; the port is another's on the node's.
+    let server = format!(
+        "import socket\ns = socket.create_server(('127.0.0.1', {}))\nwhile True: s.accept()",
+        outside.port
+    );
+    let process = json!({ "command": ["python3", "-c", server], "network": "None" });
+    let mut spec = json!({ "run": { "process": process } });
+    spec["readiness"] = json!({ "tcp": { "port": outside.port }, "period": "100ms" });
+    // A check beside it is in the same network: it sees that port listening, and no interface but the loopback.
+    let port = format!("{:04X}", outside.port);
+    let alone = "[ $(grep -c : /proc/net/dev) = 1 ]";
+    spec["startup"] = exec(&format!("grep -q ':{port} 00000000:0000 0A' /proc/net/tcp && {alone}"));
+    spec["startup"]["failureThreshold"] = json!(600);
+    controller.assign("alone", spec);
+    wait_ready(&controller, "alone", true);
+    let pid = agent.main_pid("alone", 1);
+    let of = |pid: &str, which| std::fs::read_link(format!("/proc/{pid}/ns/{which}")).unwrap();
+    for which in ["net", "ipc"] {
+        assert_ne!(of(&pid.to_string(), which), of("self", which), "{which}");
+    }
+    assert_eq!(*outside.heard.lock().unwrap(), "", "nobody came to the one outside");
+    // The same check of a program that shares the node's network finds more than a loopback, or another listener.
+    let mut shared = sh("sleep 1000");
+    shared["readiness"] = json!({ "tcp": { "port": outside.port }, "period": "100ms" });
+    controller.assign("shared", shared);
+    wait_ready(&controller, "shared", true);
+}

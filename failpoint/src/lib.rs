@@ -139,6 +139,8 @@ failpoints! {
     WorkRecord = "work-record" FILE,
     /// Agent: how the sensors of a task stand.
     SensorStatus = "sensor-status" FILE,
+    /// Agent: what the ROS master of a task's view knows.
+    RosView = "ros-view" FILE,
     /// Agent: what a gate is set up with.
     GateSettings = "gate-settings" FILE,
     /// Agent: the world of a simulated robot.

@@ -3,12 +3,15 @@
 //! | module | holds |
 //! |---|---|
 //! | [`message`], [`wire`], [`time`] | messages made from `msgs/`, with their checksums and serialisation |
+//! | [`layout`] | messages of types that are named at run time, from JSON |
 //! | [`convert`] | the same messages as protobuf, both ways |
 //! | [`name`], [`mod@env`] | graph names, namespaces, remapping; what `ROS_…` variables say |
 //! | [`xmlrpc`] | values, calls, answers; the client's and the server's side over HTTP |
 //! | [`master`] | the master's API |
+//! | [`registry`], [`roscore`] | a master: its state, and the server |
 //! | [`tcpros`] | connection headers, frames |
 //! | [`node`] | a node: its slave API, its registrations, its subscriptions and publications |
+//! | [`peer`] | what other nodes say of themselves |
 //! | [`rate`] | how often a topic is published |
 //!
 //! ```text
@@ -23,12 +26,16 @@
 
 pub mod convert;
 pub mod env;
+pub mod layout;
 pub mod master;
 pub mod message;
 pub mod name;
 pub mod node;
+pub mod peer;
 mod queue;
 pub mod rate;
+pub mod registry;
+pub mod roscore;
 pub mod tcpros;
 pub mod time;
 pub mod wire;

@@ -48,3 +48,30 @@ pub struct Description {
 pub const fn describe<M: Message>() -> Description {
     Description { name: M::TYPE, md5: M::MD5, definition: M::DEFINITION }
 }
+
+/// The message type of that name, among those that are known here.
+#[must_use]
+pub fn find(name: &str) -> Option<&'static Description> {
+    crate::ALL.iter().find(|description| description.name == name)
+}
+
+/// A message type as it is told over the wire; not every one is known here.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Type {
+    /// `nav_msgs/Odometry`.
+    pub name: String,
+    /// Its checksum.
+    pub md5: String,
+    /// Its definition.
+    pub definition: String,
+}
+
+impl From<Description> for Type {
+    fn from(description: Description) -> Self {
+        Type {
+            name: description.name.to_owned(),
+            md5: description.md5.to_owned(),
+            definition: description.definition.to_owned(),
+        }
+    }
+}

@@ -56,7 +56,7 @@ impl Reader {
     }
 
     /// The number of elements that follow, when so many can.
-    fn count(&mut self, least: usize) -> Result<usize, DecodeError> {
+    pub(crate) fn count(&mut self, least: usize) -> Result<usize, DecodeError> {
         let count = u32::read(self)? as usize;
         // An element without content still takes a turn of the loop that reads it.
         self.needs(count.saturating_mul(least.max(1)))?;

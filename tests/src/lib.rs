@@ -25,6 +25,7 @@ pub mod netns;
 pub mod puppet;
 pub mod registry;
 pub mod ros;
+pub mod ros_robot;
 pub mod wait;
 pub mod wire;
 

@@ -44,6 +44,12 @@ impl Ros {
         panic!("no roscore; its log: {}", ros.log());
     }
 
+    /// The same programs with another master, on this port of the loopback.
+    #[must_use]
+    pub fn with_master(port: u16) -> Ros {
+        Ros { dir: TempDir::with_prefix("muster-ros-").expect("a directory"), port }
+    }
+
     /// Starts the killed roscore again, on the same port.
     pub async fn start_core(&self) {
         // A process that was killed may hold the port for a moment.

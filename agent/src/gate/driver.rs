@@ -1,4 +1,4 @@
-//! One driver: a program or a socket, and what waits for it. A stop overtakes what waits.
+//! One driver: a program, a socket or a topic of ROS's, and what waits for it. A stop overtakes what waits.
 
 use std::collections::VecDeque;
 use std::io;
@@ -7,7 +7,7 @@ use std::process::Stdio;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
-use bytes::{BufMut as _, Bytes, BytesMut};
+use bytes::Bytes;
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::UnixStream;
 use tokio::net::unix::{OwnedReadHalf, OwnedWriteHalf};
@@ -16,8 +16,10 @@ use tokio::sync::{Notify, mpsc, watch};
 use tokio::time::Instant;
 use tokio_util::task::AbortOnDropHandle;
 
+use super::codec::Codec;
 use super::hall::Input;
-use super::settings::{self, Framing, Waiting};
+use super::settings::{self, Ros, Waiting};
+use super::topic::{self, Say};
 
 /// Between two tries to reach a driver.
 const AGAIN: Duration = Duration::from_millis(100);
@@ -42,6 +44,7 @@ const LOOK: Duration = Duration::from_millis(1);
 #[derive(Debug)]
 pub(super) struct Driver {
     pub(super) settings: settings::Driver,
+    codec: Codec,
     line: Arc<Line>,
     _task: AbortOnDropHandle<()>,
 }
@@ -81,7 +84,7 @@ impl Line {
             let waits = {
                 let mut state = self.state();
                 match state.frames.front() {
-                    Some(first) if first.actuator.is_none() || to.is_read() => {
+                    Some(first) if first.actuator.is_none() || to.takes_more() => {
                         state.frames.pop_front().map(Ok)
                     }
                     first => first.map(|_| Err(())),
@@ -129,17 +132,20 @@ impl Driver {
     pub(super) fn start(
         at: usize,
         settings: settings::Driver,
+        ros: &Ros,
         inputs: mpsc::Sender<Input>,
     ) -> Driver {
-        let line = Arc::new(Line::default());
-        let keeps = keep(at, settings.clone(), Arc::clone(&line), inputs);
-        Driver { settings, line, _task: AbortOnDropHandle::new(tokio::spawn(keeps)) }
+        let (line, codec) = (Arc::new(Line::default()), Codec::of(&settings));
+        let stop = codec.encode("", settings.stop.as_bytes()).unwrap_or_default();
+        let place = Place { settings: settings.clone(), ros: ros.clone(), stop };
+        let keeps = keep(place, Arc::clone(&line), Say { at, inputs });
+        Driver { settings, codec, line, _task: AbortOnDropHandle::new(tokio::spawn(keeps)) }
     }
 
     /// Whether it takes the command. One that waits for it is of a moment that is over: as the driver is set up, the newer one
     /// takes its place, or is not taken.
-    pub(super) fn command(&self, actuator: &str, data: &Bytes) -> bool {
-        let Some(bytes) = framed(self.settings.framing, data) else { return false };
+    pub(super) fn command(&self, actuator: &str, format: &str, data: &[u8]) -> bool {
+        let Some(bytes) = self.codec.encode(format, data) else { return false };
         let mut state = self.line.state();
         if !state.there {
             return false;
@@ -177,7 +183,7 @@ impl Driver {
         state.frames.clear();
         // One that is not there is stopped as soon as it is.
         if state.there {
-            let frames = texts.map(|text| framed(self.settings.framing, text.as_bytes()));
+            let frames = texts.map(|text| self.codec.encode("", text.as_bytes()));
             let frame = |bytes| Frame { bytes, actuator: None };
             state.frames.extend(frames.into_iter().flatten().map(frame));
             state.owes = true;
@@ -201,36 +207,28 @@ impl Driver {
     }
 }
 
-/// `None`: it cannot be kept apart from the next one.
-fn framed(framing: Framing, data: &[u8]) -> Option<Bytes> {
-    let mut frame = BytesMut::with_capacity(data.len() + 4);
-    match framing {
-        Framing::Lines if data.contains(&b'\n') => return None,
-        Framing::Lines => {
-            frame.put_slice(data);
-            frame.put_u8(b'\n');
-        }
-        Framing::Length => {
-            frame.put_u32(u32::try_from(data.len()).ok()?);
-            frame.put_slice(data);
-        }
-    }
-    Some(frame.freeze())
+/// Where a driver is.
+struct Place {
+    settings: settings::Driver,
+    ros: Ros,
+    /// As it reads it.
+    stop: Bytes,
 }
 
 /// Reaches the driver, feeds it, and begins again when it is gone.
-async fn keep(at: usize, settings: settings::Driver, line: Arc<Line>, inputs: mpsc::Sender<Input>) {
+async fn keep(place: Place, line: Arc<Line>, say: Say) {
+    let Say { at, inputs } = &say;
     loop {
         line.allowed().await;
-        let error = match reach(&settings).await {
+        let error = match reach(&place, &say).await {
             Ok((mut to, mut end)) => {
                 line.set_there(true);
                 // Closed: the gate ends.
-                let _ = inputs.send(Input::DriverBack(at)).await;
+                let _ = inputs.send(Input::DriverBack(*at)).await;
                 // Neither is polled again after the other has ended.
                 let error = tokio::select! {
                     error = end.gone() => Some(error),
-                    error = feed(&line, &mut to, &inputs) => Some(error),
+                    error = feed(&line, &mut to, inputs) => Some(error),
                     () = line.cut_off() => None,
                 };
                 line.set_there(false);
@@ -240,7 +238,7 @@ async fn keep(at: usize, settings: settings::Driver, line: Arc<Line>, inputs: mp
             Err(error) => Some(error),
         };
         let why = error.map_or_else(|| "its power is cut".to_owned(), |error| error.to_string());
-        let _ = inputs.send(Input::DriverGone(at, why)).await;
+        let _ = inputs.send(Input::DriverGone(*at, why)).await;
         tokio::time::sleep(AGAIN).await;
     }
 }
@@ -249,6 +247,7 @@ async fn keep(at: usize, settings: settings::Driver, line: Arc<Line>, inputs: mp
 enum End {
     Program(Child),
     Socket(OwnedReadHalf),
+    Topic(Box<topic::End>),
 }
 
 impl End {
@@ -259,6 +258,7 @@ impl End {
                 Ok(status) => io::Error::other(format!("it ended: {status}")),
                 Err(error) => error,
             },
+            End::Topic(end) => end.gone().await,
             End::Socket(from) => {
                 // What a driver says is for its own log.
                 let mut heard = [0; 1024];
@@ -286,6 +286,7 @@ impl End {
                 drop(child.kill().await);
             }
             End::Socket(from) => drop(from),
+            End::Topic(end) => end.now().await,
         }
     }
 }
@@ -294,13 +295,26 @@ impl End {
 enum To {
     Pipe(ChildStdin),
     Socket(OwnedWriteHalf),
+    Topic(topic::To),
 }
 
 impl To {
-    async fn write(&mut self, frame: &[u8]) -> io::Result<()> {
+    async fn write(&mut self, frame: &Frame) -> io::Result<()> {
         match self {
-            To::Pipe(to) => to.write_all(frame).await,
-            To::Socket(to) => to.write_all(frame).await,
+            To::Pipe(to) => to.write_all(&frame.bytes).await,
+            To::Socket(to) => to.write_all(&frame.bytes).await,
+            To::Topic(to) => {
+                to.write(&frame.bytes, frame.actuator.is_none());
+                Ok(())
+            }
+        }
+    }
+
+    /// Whether it may be given another command.
+    fn takes_more(&self) -> bool {
+        match self {
+            To::Pipe(_) | To::Socket(_) => self.is_read(),
+            To::Topic(to) => to.takes_more(),
         }
     }
 
@@ -310,13 +324,20 @@ impl To {
         let (fd, what) = match self {
             To::Pipe(to) => (to.as_raw_fd(), libc::FIONREAD),
             To::Socket(to) => (to.as_ref().as_raw_fd(), libc::TIOCOUTQ),
+            To::Topic(to) => return to.is_read(),
         };
         // SAFETY: the descriptor is open, and both requests write one int.
         unsafe { libc::ioctl(fd, what, &mut bytes) != 0 || bytes == 0 }
     }
 }
 
-async fn reach(settings: &settings::Driver) -> io::Result<(To, End)> {
+async fn reach(place: &Place, say: &Say) -> io::Result<(To, End)> {
+    let Place { settings, ros, stop } = place;
+    if let Some(topic) = &settings.ros1 {
+        let reached = topic::reach(topic, settings.waiting, (ros, stop.clone()), say.clone());
+        let (to, end) = reached.await?;
+        return Ok((To::Topic(to), End::Topic(Box::new(end))));
+    }
     if let Some(path) = &settings.unix {
         let stream = UnixStream::connect(path).await?;
         // The kernel takes no less than its least.
@@ -365,7 +386,7 @@ async fn feed(line: &Line, to: &mut To, inputs: &mpsc::Sender<Input>) -> io::Err
                 false => return deaf(),
             },
         };
-        match tokio::time::timeout(within, to.write(&frame.bytes)).await {
+        match tokio::time::timeout(within, to.write(&frame)).await {
             Ok(Ok(())) => {}
             Ok(Err(error)) => return error,
             // A stop may wait behind it, and would wait for ever.
@@ -409,7 +430,7 @@ mod tests {
         listener: &UnixListener,
     ) -> (Driver, UnixStream, mpsc::Receiver<Input>) {
         let (inputs, mut heard) = mpsc::channel(4);
-        let driver = Driver::start(0, settings, inputs);
+        let driver = Driver::start(0, settings, &Ros::default(), inputs);
         let (stream, _) = listener.accept().await.unwrap();
         assert!(matches!(heard.recv().await, Some(Input::DriverBack(0))));
         (driver, stream, heard)
@@ -427,8 +448,7 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let (settings, listener) = deaf(&dir.path().join("driver"));
         let (driver, mut stream, _heard) = reached(settings, &listener).await;
-        let go =
-            |text: &'static str| driver.command("base:Drive", &Bytes::from_static(text.as_bytes()));
+        let go = |text: &'static str| driver.command("base:Drive", "", text.as_bytes());
         assert!(go("first"));
         written(&driver).await;
         for _ in 0..3 {
@@ -455,13 +475,13 @@ mod tests {
         {
             settings.waiting = waiting;
             let (driver, mut stream, _heard) = reached(settings.clone(), &listener).await;
-            assert!(driver.command("base:Drive", &Bytes::from_static(b"twist 0")));
+            assert!(driver.command("base:Drive", "", b"twist 0"));
             written(&driver).await;
-            assert!(driver.command("arm:Grasp", &Bytes::from_static(b"close")));
-            assert!(driver.command("base:Drive", &Bytes::from_static(b"twist 1")));
+            assert!(driver.command("arm:Grasp", "", b"close"));
+            assert!(driver.command("base:Drive", "", b"twist 1"));
             for n in 2..=20 {
-                let twist = Bytes::from(format!("twist {n}"));
-                assert_eq!(driver.command("base:Drive", &twist), taken);
+                let twist = format!("twist {n}");
+                assert_eq!(driver.command("base:Drive", "", twist.as_bytes()), taken);
             }
             let mut read = async |text: &str| {
                 let mut bytes = vec![0; text.len()];
@@ -510,17 +530,10 @@ mod tests {
             let mut heard = [0; 3];
             runtime.block_on(async {
                 stream.write_all(bytes).await.unwrap();
-                assert!(driver.command("base:Drive", &Bytes::from_static(b"go")));
+                assert!(driver.command("base:Drive", "", b"go"));
                 stream.read_exact(&mut heard).await.unwrap();
             });
             assert_eq!(&heard, b"go\n");
         });
-    }
-
-    #[test]
-    fn frames() {
-        assert_eq!(framed(Framing::Lines, b"go").unwrap(), "go\n");
-        assert_eq!(framed(Framing::Lines, b"go\non"), None);
-        assert_eq!(framed(Framing::Length, b"a\n").unwrap().as_ref(), b"\0\0\0\x02a\n");
     }
 }

@@ -22,7 +22,8 @@ use super::door::{self, Back};
 use super::driver::Driver;
 use super::log::Log;
 use super::record::{self, Record};
-use super::settings::Settings;
+use super::settings::Setup;
+use super::topic::Doubt;
 use super::{AGENT_SOCKET, GateError, LOG, SOCKET, TASKS_DIR, hook, keeper};
 use crate::clock;
 use crate::socket;
@@ -58,6 +59,8 @@ pub(super) enum Input {
     /// A driver has read its stop.
     DriverStands,
     DriverGone(usize, String),
+    /// Whether others may command a driver.
+    DriverShared(usize, Option<Doubt>),
     Hook(String, Tier),
 }
 
@@ -73,6 +76,7 @@ struct Command {
     /// Absent: no driver moves that.
     driver: Option<usize>,
     actuator: String,
+    format: String,
     data: Bytes,
 }
 
@@ -93,6 +97,8 @@ struct Hall {
     drivers: Vec<Driver>,
     /// Why a driver is not there.
     missing: Vec<Option<String>>,
+    /// Why others may command one.
+    shared: Vec<Option<Doubt>>,
     /// By token.
     seats: BTreeMap<String, TaskUid>,
     conns: BTreeMap<Conn, (TaskUid, Back<proto::Event>)>,
@@ -114,7 +120,7 @@ struct Hall {
 }
 
 /// Runs until it is told to end.
-pub(super) async fn serve(dir: PathBuf, settings: Settings) -> Result<(), GateError> {
+pub(super) async fn serve(dir: PathBuf, setup: Setup) -> Result<(), GateError> {
     let system = |what| move |source| GateError::System { what, source };
     let kept = record::read(&dir)?;
     let mut end = signal(SignalKind::terminate()).map_err(system("hear signals"))?;
@@ -124,9 +130,11 @@ pub(super) async fn serve(dir: PathBuf, settings: Settings) -> Result<(), GateEr
         socket::listen(&dir.join(AGENT_SOCKET), 0o600).map_err(system("listen for agents"))?;
     let (inputs, mut calls) = mpsc::channel(INPUTS);
     let (urgently, mut urgent) = mpsc::channel(INPUTS);
+    let settings = &setup.settings;
     let (core, response) = Gate::start(settings.core(), kept);
-    let driver =
-        |(at, driver): (usize, &_)| Driver::start(at, Clone::clone(driver), urgently.clone());
+    let driver = |(at, driver): (usize, &_)| {
+        Driver::start(at, Clone::clone(driver), &setup.ros, urgently.clone())
+    };
     let drivers: Vec<Driver> = settings.drivers.iter().enumerate().map(driver).collect();
     let mut others = JoinSet::new();
     for hook in settings.estop.clone() {
@@ -135,7 +143,7 @@ pub(super) async fn serve(dir: PathBuf, settings: Settings) -> Result<(), GateEr
     others.spawn(door::tasks(tasks, inputs, urgently.clone()));
     others.spawn(door::agents(agents, urgently));
     let record = Record::new(record::write_to(&dir));
-    let mut hall = Hall::new(dir, keeper::digest(&settings), (core, drivers), record);
+    let mut hall = Hall::new(dir, keeper::digest(&setup), (core, drivers), record);
     tracing::info!(newest = %hall.core.newest(), estop = %hall.core.estop().tier(), "the gate starts");
     hall.run(response, (&mut urgent, &mut calls), &mut end).await;
     // Nobody stands before the drivers any more.
@@ -156,6 +164,7 @@ impl Hall {
             digest,
             core,
             missing: vec![Some("it has not been reached yet".to_owned()); drivers.len()],
+            shared: vec![None; drivers.len()],
             drivers,
             seats: BTreeMap::new(),
             conns: BTreeMap::new(),
@@ -253,6 +262,13 @@ impl Hall {
                     self.tell_agent();
                 }
             }
+            Input::DriverShared(at, doubt) => {
+                if self.shared[at] != doubt {
+                    tracing::info!(driver = at, ?doubt, "whether others may command a driver");
+                    self.shared[at] = doubt;
+                    self.tell_agent();
+                }
+            }
             Input::Hook(name, tier) => self.event(&Event::EStop(Source::Local(name), tier)),
         }
     }
@@ -271,8 +287,8 @@ impl Hall {
                 };
                 let driver = self.drivers.iter().position(drives);
                 let token = token(command.lease.as_ref());
-                let proto::Command { id, actuator, data, .. } = command;
-                let command = Some(Command { driver, actuator, data });
+                let proto::Command { id, actuator, format, data, .. } = command;
+                let command = Some(Command { driver, actuator, format, data });
                 let event = token.map(|token| Event::Command(conn, token));
                 self.answered(event, About { conn, id, command });
             }
@@ -337,9 +353,9 @@ impl Hall {
         let late = stops != self.stops;
         let taken = about.command.filter(|_| forward && !late).is_some_and(|command| {
             command.data.len() <= LONGEST
-                && command
-                    .driver
-                    .is_some_and(|at| self.drivers[at].command(&command.actuator, &command.data))
+                && command.driver.is_some_and(|at| {
+                    self.drivers[at].command(&command.actuator, &command.format, &command.data)
+                })
         });
         let verdict = match wire(verdict) {
             proto::Verdict::Ok if forward && !taken => match self.core.estop().tier() {
@@ -445,11 +461,16 @@ impl Hall {
             unread.then(|| "it has not read its stop yet".to_owned())
         };
         let record = self.record.error().map(|error| format!("the gate's record: {error}"));
-        let driver = |(driver, missing): (&Driver, &Option<String>)| {
-            let error = missing.clone().or_else(|| unread(driver)).or_else(|| record.clone());
+        let driver = |(at, driver): (usize, &Driver)| {
+            let missing = self.missing[at].clone();
+            let error = missing.or_else(|| unread(driver)).or_else(|| record.clone());
             proto::Driver {
                 actuators: driver.settings.actuators.iter().map(ToString::to_string).collect(),
                 error: error.unwrap_or_default(),
+                doubt: self.shared[at].as_ref().map(|doubt| proto::Doubt {
+                    reason: doubt.reason.to_owned(),
+                    why: doubt.why.clone(),
+                }),
             }
         };
         let status = proto::Status {
@@ -461,7 +482,7 @@ impl Hall {
                 number: estop.number(),
                 demands: estop.demands().map(demand).collect(),
             }),
-            drivers: self.drivers.iter().zip(&self.missing).map(driver).collect(),
+            drivers: self.drivers.iter().enumerate().map(driver).collect(),
             silent: self.silent,
             gives_back: self.gives_back.as_ref().map(holder),
             settings: self.digest.clone(),
@@ -510,6 +531,7 @@ mod tests {
 
     use super::*;
     use crate::gate::record::Write;
+    use crate::gate::settings::Ros;
 
     const HOLDER: Conn = Conn(1);
 
@@ -539,7 +561,10 @@ mod tests {
         let lease = Some(proto::Lease { epoch: 6, sequence: lease.to_vec() });
         let data = Bytes::from_static(data.as_bytes());
         let actuator = "base:Drive".to_owned();
-        Input::Call(HOLDER, Said::Command(proto::Command { id, lease, actuator, data }))
+        Input::Call(
+            HOLDER,
+            Said::Command(proto::Command { id, lease, actuator, data, ..Default::default() }),
+        )
     }
 
     impl Scene {
@@ -551,8 +576,8 @@ mod tests {
                 serde_json::json!({"actuators": ["base:Drive"], "unix": path, "stop": "stop"});
             let (urgent, mut urgently) = mpsc::channel(INPUTS);
             let (calls, mut called) = mpsc::channel(INPUTS);
-            let driver =
-                Driver::start(0, serde_json::from_value(settings).unwrap(), urgent.clone());
+            let settings = serde_json::from_value(settings).unwrap();
+            let driver = Driver::start(0, settings, &Ros::default(), urgent.clone());
             let disk = Arc::new(Mutex::new(()));
             let held = Arc::clone(&disk);
             let write: Write = Arc::new(move |_| {

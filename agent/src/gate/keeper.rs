@@ -17,27 +17,28 @@ use muster_failpoint::Failpoint;
 use tokio::net::UnixStream;
 use tokio::sync::watch;
 
-use super::settings::{self, Settings};
+use super::settings::{self, Setup};
 use super::{AGENT_SOCKET, LOG, Standing, TASKS_DIR, VERB, Wanted};
 use crate::companion::{self, Kept};
 use crate::driver::chain;
 use crate::durable::{self, FileError, Keep};
 use crate::executor::frame;
 use crate::runtime::process::Reexec;
+use crate::view::Actuator;
 
 /// The agent says what it wants at least so often; see `hall`'s `STUCK`.
 const SAY_EVERY: Duration = Duration::from_secs(1);
 
 /// How a gate is set up, in short.
-pub(super) fn digest(settings: &Settings) -> String {
-    let text = serde_json::to_vec(settings).unwrap_or_default();
+pub(super) fn digest(setup: &Setup) -> String {
+    let text = serde_json::to_vec(setup).unwrap_or_default();
     companion::digest(&text)
 }
 
 /// Keeps one gate.
 #[derive(Debug)]
 pub(crate) struct Keeper {
-    settings: Settings,
+    setup: Setup,
     dir: PathBuf,
     program: PathBuf,
     wanted: Mutex<Wanted>,
@@ -48,15 +49,21 @@ pub(crate) struct Keeper {
 
 impl Keeper {
     /// A keeper of the gate in `dir`; nothing is started yet.
-    pub(crate) fn new(settings: Settings, dir: PathBuf, reexec: &Reexec) -> Keeper {
+    pub(crate) fn new(setup: Setup, dir: PathBuf, reexec: &Reexec) -> Keeper {
         Keeper {
-            settings,
+            setup,
             dir,
             program: reexec.program.clone(),
             wanted: Mutex::default(),
             newest: watch::Sender::default(),
             standing: watch::Sender::default(),
         }
+    }
+
+    /// The drivers that are topics of ROS's.
+    pub(crate) fn topics(&self) -> Vec<Actuator> {
+        let actuator = |(topic, actuator)| Actuator { topic, actuator };
+        self.setup.topics().map(actuator).collect()
     }
 
     /// Where tasks find their socket.
@@ -129,7 +136,7 @@ impl Keeper {
             }
         };
         let read = async {
-            let mine = digest(&self.settings);
+            let mine = digest(&self.setup);
             while let Some(status) = frame::read::<proto::Status, _>(&mut from).await? {
                 if status.settings != mine {
                     // Another set-up: it stops the robot and ends, and the next one begins with a stop.
@@ -171,7 +178,7 @@ impl Kept for Keeper {
         durable::write_json(
             Failpoint::GateSettings,
             &dir.join(settings::FILE),
-            &self.settings,
+            &self.setup,
             Keep::Crash,
         )?;
         let path = dir.join(LOG);

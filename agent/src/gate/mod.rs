@@ -2,7 +2,7 @@
 //! stopped is decided in `muster_agent_core::gate`.
 //!
 //! ```text
-//!  task ⇄ door ──┐                            ┌──▶ driver (program or socket)
+//!  task ⇄ door ──┐                            ┌──▶ driver (program, socket or ROS topic)
 //!  task ⇄ door ──┼──▶ hall: core decides ─────┼──▶ driver
 //!  agent ⇄ desk ─┤      │ kept.json           └
 //!  button ▶ hook ┘
@@ -14,6 +14,8 @@
 //! | `hall` | gate | the one task that asks the core and carries out what it says |
 //! | `door` | gate | sockets of tasks and of the agent |
 //! | `driver` | gate | one driver, and what waits for it |
+//! | `codec` | gate | how a command becomes what a driver reads |
+//! | `topic` | gate | a driver that is a topic of ROS 1, and who else publishes it |
 //! | `hook` | gate | files and pins that stop the robot |
 //! | `record` | gate | what must be durable, and what waits for that |
 //! | `log` | gate | its log, bounded |
@@ -31,6 +33,7 @@
 //! | `tasks/socket` | gate | the tasks' socket, in a directory of its own that containers see |
 //! | `log`, `log.1` | gate, drivers | what they have to say; the older part of it |
 
+mod codec;
 pub(crate) mod door;
 mod driver;
 mod hall;
@@ -40,6 +43,7 @@ mod log;
 mod record;
 pub(crate) mod settings;
 mod standing;
+mod topic;
 mod wanted;
 
 use std::ffi::OsString;
@@ -48,7 +52,7 @@ use std::path::PathBuf;
 
 use crate::companion;
 use crate::durable::{self, FileError};
-use settings::Settings;
+use settings::Setup;
 pub use standing::Standing;
 pub use wanted::Wanted;
 
@@ -98,9 +102,9 @@ fn run(dir: PathBuf) -> Result<(), GateError> {
     let written = lock.set_len(0).and_then(|()| lock.write_all(pid.as_bytes()));
     written.map_err(FileError::at("write the lock of", &dir))?;
     let path = dir.join(settings::FILE);
-    let settings: Settings = durable::read_json(&path)?.ok_or(GateError::NoSettings(path))?;
+    let setup: Setup = durable::read_json(&path)?.ok_or(GateError::NoSettings(path))?;
     // The record's and the log's.
     let runtime =
         companion::runtime(2).map_err(|source| GateError::System { what: "start", source })?;
-    runtime.block_on(hall::serve(dir, settings))
+    runtime.block_on(hall::serve(dir, setup))
 }

@@ -6,6 +6,9 @@
 //!     - actuators: ["base:Drive"]
 //!       exec: [/usr/lib/robot/base-driver]     # or unix: /run/robot/base.sock; or sim: Base, with nothing beside
 //!       stop: '{"linear": 0, "angular": 0}'
+//!     - actuators: ["arm:Move"]                # a topic of ROS 1, which the gate publishes; commands are JSON
+//!       ros1: {topic: /arm/command, type: std_msgs/Float64, node: /arm_driver}
+//!       stop: {data: 0}                        # of a Twist known: it stands
 //!   ladder: [{after: 100ms, action: Log}, {after: 200ms, action: Stop}, {after: 30s, action: Release}]
 //!   agentGrace: 0s
 //!   estop:
@@ -19,8 +22,14 @@ use std::path::{Path, PathBuf};
 use muster_agent_core::gate::{self, Action, Step, Tier};
 use muster_api::duration::Span;
 use muster_api::name::FunctionName;
-use serde::{Deserialize, Serialize};
+use muster_ros1::env::{DEFAULT_MASTER, Environment};
+use muster_ros1::layout::Layout;
+use muster_ros1::message;
+use muster_ros1::name::{NameError, Resolver};
+use serde::{Deserialize, Deserializer, Serialize};
 
+use crate::driver::chain;
+use crate::position::settings::PoseSettings;
 use crate::sim;
 
 /// The file, in the gate's directory.
@@ -38,6 +47,25 @@ pub(crate) struct Settings {
     agent_grace: Span,
     /// What stops the robot on the robot.
     pub(crate) estop: Vec<Hook>,
+}
+
+/// All that a gate is set up with.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct Setup {
+    pub(super) settings: Settings,
+    pub(super) ros: Ros,
+}
+
+/// Where the robot's ROS is; nothing, when no driver is a topic.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Ros {
+    pub(super) master: String,
+    pub(super) host: Option<String>,
+    pub(super) namespace: Option<String>,
+    /// This node of muster's.
+    pub(super) robot: String,
 }
 
 /// One step of the ladder.
@@ -63,21 +91,63 @@ pub(crate) struct Driver {
     /// The simulated robot's base.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     sim: Option<Simulated>,
+    /// A topic of ROS 1 that it subscribes.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(super) ros1: Option<Topic>,
     /// How commands are kept apart.
     #[serde(default)]
     pub(super) framing: Framing,
     /// What becomes of a command for an actuator while another one for it waits until the driver has read.
     #[serde(default)]
     pub(super) waiting: Waiting,
-    /// The command that stops what it moves; the simulator's is known.
-    #[serde(default)]
+    /// The command that stops what it moves; the simulator's and a Twist's are known.
+    #[serde(default, deserialize_with = "command")]
     pub(super) stop: String,
     /// The command to stay as it is; absent: the stop command.
-    #[serde(default)]
+    #[serde(default, deserialize_with = "maybe_command")]
     pub(super) hold: Option<String>,
-    /// The command that cuts the power; absent: the driver is ended, or its socket closed.
-    #[serde(default)]
+    /// The command that cuts the power; absent: the driver is ended, or its socket closed, or its topic not published.
+    #[serde(default, deserialize_with = "maybe_command")]
     pub(super) cut: Option<String>,
+}
+
+/// A topic of ROS 1.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "camelCase", deny_unknown_fields)]
+pub(super) struct Topic {
+    /// Its name; one without a slash is in `--ros-namespace`.
+    pub(super) topic: String,
+    /// `geometry_msgs/Twist`.
+    #[serde(rename = "type")]
+    pub(super) kind: String,
+    /// The driver's name in ROS; absent: whoever subscribes the topic is taken for it.
+    #[serde(default)]
+    pub(super) node: Option<String>,
+}
+
+impl Topic {
+    /// Of its messages; none: the type is not known.
+    pub(super) fn layout(&self) -> Option<Layout> {
+        message::find(&self.kind).map(Layout::of)
+    }
+
+    /// The message of nothing, where that is known to be a stop: no velocity.
+    fn stop(&self) -> Option<&'static str> {
+        matches!(&*self.kind, "geometry_msgs/Twist" | "geometry_msgs/TwistStamped").then_some("{}")
+    }
+}
+
+/// A text; or a mapping, which is JSON.
+fn command<'de, D: Deserializer<'de>>(from: D) -> Result<String, D::Error> {
+    serde_json::Value::deserialize(from).map(|value| match value {
+        serde_json::Value::String(text) => text,
+        serde_json::Value::Null => String::new(),
+        other => other.to_string(),
+    })
+}
+
+fn maybe_command<'de, D: Deserializer<'de>>(from: D) -> Result<Option<String>, D::Error> {
+    command(from).map(|text| Some(text).filter(|text| !text.is_empty()))
 }
 
 /// A driver of the simulated robot.
@@ -135,12 +205,14 @@ fn cut() -> Tier {
 /// Why settings make no sense.
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum SettingsError {
-    #[error("drivers[{0}]: give exactly one of exec, unix and sim")]
+    #[error("drivers[{0}]: give exactly one of exec, unix, ros1 and sim")]
     Way(usize),
     #[error("drivers[{0}].stop: say the command that stops what it moves")]
     NoStopCommand(usize),
     #[error("drivers[{0}].{1}: the simulator's is known; leave it out")]
     Known(usize, &'static str),
+    #[error("drivers[{0}].framing: messages of a topic are kept apart by ROS; leave it out")]
+    Framed(usize),
     #[error("drivers[{0}].sim: this robot is not simulated; its position would be sim:world.yaml")]
     NotSimulated(usize),
     #[error("drivers[{0}].actuators: name what it moves, as in [\"base:Drive\"]")]
@@ -155,6 +227,17 @@ pub(crate) enum SettingsError {
     NotDeclared { at: usize, actuator: FunctionName },
     #[error("drivers[{at}].{field}: a command with a newline needs `framing: Length`")]
     Newline { at: usize, field: &'static str },
+    #[error("drivers[{at}].ros1.{field}")]
+    Name {
+        at: usize,
+        field: &'static str,
+        #[source]
+        source: NameError,
+    },
+    #[error("drivers[{at}].ros1.type: {kind:?} is not known; known are {known}")]
+    Type { at: usize, kind: String, known: String },
+    #[error("drivers[{at}].{field}: {text} is no {kind}: {why}")]
+    Message { at: usize, field: &'static str, text: String, kind: String, why: String },
     #[error("ladder: there is no Stop in it; a robot whose driver is silent would go on for ever")]
     NoStop,
     #[error("ladder[{0}]: Hold comes before Stop")]
@@ -185,6 +268,23 @@ impl Settings {
             }
         }
         Ok(self)
+    }
+
+    /// All that a gate of the robot `robot` needs.
+    pub(crate) fn set_up(mut self, pose: &PoseSettings, robot: &str) -> Setup {
+        let topics = self.drivers.iter_mut().filter_map(|driver| {
+            let known = driver.ros1.as_ref()?.stop();
+            Some((driver, known))
+        });
+        let mut any = false;
+        for (driver, known) in topics {
+            any = true;
+            if let Some(known) = known.filter(|_| driver.stop.is_empty()) {
+                known.clone_into(&mut driver.stop);
+            }
+        }
+        let ros = if any { Ros::of(pose, robot) } else { Ros::default() };
+        Setup { settings: self, ros }
     }
 
     /// Says what makes no sense.
@@ -253,9 +353,45 @@ impl Settings {
     }
 }
 
+impl Setup {
+    /// The drivers that are topics: the topic's global name, and an actuator that it moves.
+    pub(crate) fn topics(&self) -> impl Iterator<Item = (String, String)> {
+        let names = Resolver::new(self.ros.namespace.as_deref().unwrap_or("/"), "gate", []).ok();
+        self.settings.drivers.iter().filter_map(move |driver| {
+            let topic = names.as_ref()?.resolve(&driver.ros1.as_ref()?.topic).ok()?;
+            Some((topic, driver.actuators.first()?.to_string()))
+        })
+    }
+}
+
+impl Ros {
+    /// What is not said is the environment's, as ROS has it.
+    fn of(pose: &PoseSettings, robot: &str) -> Ros {
+        let environment = Environment::read();
+        let master = pose.master.clone().or(environment.master);
+        Ros {
+            master: master.unwrap_or_else(|| DEFAULT_MASTER.to_owned()),
+            host: pose.host.clone().or(environment.host),
+            namespace: pose.namespace.clone().or(environment.namespace),
+            robot: robot.to_owned(),
+        }
+    }
+}
+
 impl Driver {
+    /// The commands that the gate gives by itself.
+    fn own_commands(&self) -> impl Iterator<Item = (&'static str, &String)> {
+        let all = [
+            ("stop", Some(&self.stop).filter(|stop| !stop.is_empty())),
+            ("hold", self.hold.as_ref()),
+            ("cut", self.cut.as_ref()),
+        ];
+        all.into_iter().filter_map(|(field, text)| Some((field, text?)))
+    }
+
     fn check_way(&self, at: usize) -> Result<(), SettingsError> {
-        let ways = [!self.exec.is_empty(), self.unix.is_some(), self.sim.is_some()];
+        let ways =
+            [!self.exec.is_empty(), self.unix.is_some(), self.sim.is_some(), self.ros1.is_some()];
         if ways.into_iter().filter(|given| *given).count() != 1 {
             return Err(SettingsError::Way(at));
         }
@@ -266,18 +402,45 @@ impl Driver {
             ("framing", self.framing != Framing::default()),
         ];
         match (self.sim, known.into_iter().find(|(_, given)| *given)) {
-            (Some(_), Some((field, _))) => Err(SettingsError::Known(at, field)),
-            (None, _) if self.stop.is_empty() => Err(SettingsError::NoStopCommand(at)),
-            _ => Ok(()),
+            (Some(_), Some((field, _))) => return Err(SettingsError::Known(at, field)),
+            (Some(_), None) => return Ok(()),
+            (None, _) => {}
         }
+        let known = self.ros1.as_ref().and_then(Topic::stop);
+        if self.stop.is_empty() && known.is_none() {
+            return Err(SettingsError::NoStopCommand(at));
+        }
+        self.ros1.as_ref().map_or(Ok(()), |topic| self.check_topic(at, topic))
+    }
+
+    fn check_topic(&self, at: usize, topic: &Topic) -> Result<(), SettingsError> {
+        if self.framing != Framing::default() {
+            return Err(SettingsError::Framed(at));
+        }
+        let names = [("topic", Some(&topic.topic)), ("node", topic.node.as_ref())];
+        for (field, name) in names.into_iter().filter_map(|(field, name)| Some((field, name?))) {
+            let resolved = Resolver::new("/", "gate", []).and_then(|names| names.resolve(name));
+            resolved.map_err(|source| SettingsError::Name { at, field, source })?;
+        }
+        let layout = topic.layout().ok_or_else(|| {
+            let known: Vec<&str> = muster_ros1::ALL.iter().map(|known| known.name).collect();
+            SettingsError::Type { at, kind: topic.kind.clone(), known: known.join(", ") }
+        })?;
+        for (field, text) in self.own_commands() {
+            let json = serde_json::from_str(text).map_err(|error| error.to_string());
+            let encoded = json.and_then(|json| layout.encode(&json).map_err(|e| chain(&e)));
+            encoded.map_err(|why| {
+                let (text, kind) = (text.clone(), topic.kind.clone());
+                SettingsError::Message { at, field, text, kind, why }
+            })?;
+        }
+        Ok(())
     }
 
     fn check_lines(&self, at: usize) -> Result<(), SettingsError> {
-        let commands =
-            [("stop", Some(&self.stop)), ("hold", self.hold.as_ref()), ("cut", self.cut.as_ref())];
-        let torn = |(_, text): &(_, Option<&String>)| text.is_some_and(|text| text.contains('\n'));
-        match commands.into_iter().find(torn) {
-            Some((field, _)) if self.framing == Framing::Lines => {
+        let torn = |(_, text): &(_, &String)| text.contains('\n');
+        match self.own_commands().find(torn) {
+            Some((field, _)) if self.framing == Framing::Lines && self.ros1.is_none() => {
                 Err(SettingsError::Newline { at, field })
             }
             _ => Ok(()),
@@ -341,6 +504,26 @@ mod tests {
                 "drivers: [{actuators: ['base:Drive'], exec: [a], stop: \"a\\nb\"}]",
                 "drivers[0].stop",
             ),
+            (
+                "drivers: [{actuators: ['base:Drive'], ros1: {topic: '/a b', type: geometry_msgs/Twist}}]",
+                "drivers[0].ros1.topic",
+            ),
+            (
+                "drivers: [{actuators: ['base:Drive'], ros1: {topic: /a, type: std_msgs/Float64}}]",
+                "drivers[0].stop: say",
+            ),
+            (
+                "drivers: [{actuators: ['base:Drive'], ros1: {topic: /a, type: my_msgs/Go}, stop: {}}]",
+                "\"my_msgs/Go\" is not known; known are geometry_msgs/Accel, ",
+            ),
+            (
+                "drivers: [{actuators: ['base:Drive'], ros1: {topic: /a, type: std_msgs/Float64}, stop: {data: x}}]",
+                "drivers[0].stop: {\"data\":\"x\"} is no std_msgs/Float64: data must be a number",
+            ),
+            (
+                "drivers: [{actuators: ['base:Drive'], ros1: {topic: /a, type: geometry_msgs/Twist}, framing: Length}]",
+                "drivers[0].framing: messages of a topic",
+            ),
             ("ladder: []", "no Stop"),
             ("ladder: [{after: 1s, action: Stop}, {after: 2s, action: Hold}]", "ladder[1]: Hold"),
             (
@@ -355,6 +538,30 @@ mod tests {
             let refusal = refusal(text);
             assert!(refusal.contains(part), "{text}: {refusal}");
         }
+    }
+
+    #[test]
+    fn a_twist_of_nothing_is_a_stop() {
+        let actuators = BTreeSet::from(["base:Drive".parse().unwrap()]);
+        let drivers = |more: &str| {
+            let topic = "ros1: {topic: cmd_vel, type: geometry_msgs/Twist}";
+            let text = format!("drivers: [{{actuators: ['base:Drive'], {topic}{more}}}]");
+            let settings = settings(&text);
+            settings.check(&actuators).unwrap();
+            let pose = crate::position::settings::PoseArgs {
+                ros_master: Some("http://robot:11311".to_owned()),
+                ..Default::default()
+            };
+            settings.set_up(&pose.resolve().unwrap(), "robot-1")
+        };
+        let setup = drivers("");
+        assert_eq!(setup.settings.drivers[0].stop, "{}");
+        assert_eq!(setup.ros.master, "http://robot:11311/");
+        let setup = drivers(", stop: {linear: {x: 0.0}}, hold: '{}'");
+        assert_eq!(setup.settings.drivers[0].stop, r#"{"linear":{"x":0.0}}"#);
+        assert_eq!(setup.settings.drivers[0].hold.as_deref(), Some("{}"));
+        let again = serde_json::to_string(&setup).unwrap();
+        assert_eq!(serde_json::from_str::<Setup>(&again).unwrap(), setup);
     }
 
     #[test]

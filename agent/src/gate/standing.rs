@@ -43,6 +43,10 @@ impl Standing {
                 format!("the driver of {moves} is not there: {}", driver.error),
             );
         }
+        let shared = status.drivers.iter().find_map(|driver| driver.doubt.as_ref());
+        if let Some(doubt) = shared {
+            return Condition::new(ACTUATORS_FENCED, false, &doubt.reason, doubt.why.clone());
+        }
         let driven = |actuator: &&FunctionName| {
             status.drivers.iter().flat_map(|d| &d.actuators).all(|a| *a != actuator.to_string())
         };

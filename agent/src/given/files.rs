@@ -288,6 +288,7 @@ mod tests {
 
     use super::*;
     use crate::runtime::Limits;
+    use crate::runtime::launch::Network;
 
     fn launch(files: &[(&str, &str, u32, bool)], attempt: u32) -> Launch {
         let file = |(directory, path, mode, secret): &(&str, &str, u32, bool)| proto::File {
@@ -301,7 +302,12 @@ mod tests {
             proto::Config { files: files.iter().map(file).collect(), ..Default::default() };
         Launch {
             id: AttemptId { uid: TaskUid::new("t"), attempt },
-            program: Program::Process { argv: Vec::new(), working_dir: None, user: None },
+            program: Program::Process {
+                argv: Vec::new(),
+                working_dir: None,
+                user: None,
+                network: Network::Host,
+            },
             env: BTreeMap::new(),
             given: Some(Arc::new(config)),
             limits: Limits::default(),

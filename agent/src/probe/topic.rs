@@ -15,16 +15,15 @@ use futures::FutureExt;
 use muster_agent_core::probe::topic::{Seen, Wanted, judge};
 use muster_agent_core::probe::{Answer, Role};
 use muster_api::kind::task::probe::TopicCheck;
-use muster_ros1::env::{DEFAULT_MASTER, Environment};
+use muster_ros1::env::Environment;
 use muster_ros1::name::Resolver;
 use muster_ros1::node::{Arrivals, MasterState};
 use muster_ros1::{Node, NodeOptions};
 use tokio::sync::Mutex;
 use tokio::time::MissedTickBehavior;
 
-use crate::config::Config;
 use crate::driver::chain;
-use crate::position::PositionSource;
+use crate::ros::Ros;
 use crate::runtime::Launch;
 
 /// Between two looks at a topic that has not been watched for a whole window.
@@ -33,38 +32,12 @@ const LOOK: Duration = Duration::from_millis(50);
 /// A node that has not been needed from one of these to the next goes. A task that is started again needs it at once.
 const SWEEP: Duration = Duration::from_secs(30);
 
-/// What this node knows of ROS for tasks that do not say.
-#[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub(crate) struct Ros {
-    /// The name of the agent's node in ROS.
-    name: String,
-    /// None: nobody has said where a master is.
-    master: Option<String>,
-    /// Under what name or address ROS nodes reach this machine.
-    host: Option<String>,
-    namespace: Option<String>,
-}
-
-impl Ros {
-    /// By the agent's flags, then its environment; who reads poses from ROS without a word of a master means ROS's default.
-    pub(crate) fn new(config: &Config, node: &str) -> Ros {
-        let environment = Environment::read();
-        let poses = matches!(config.position, Some(PositionSource::Ros1(_)));
-        let default = poses.then(|| DEFAULT_MASTER.to_owned());
-        let plain = node.chars().map(|c| if c.is_ascii_alphanumeric() { c } else { '_' });
-        Ros {
-            name: format!("muster_probes_{}", plain.collect::<String>()),
-            master: config.pose.master.clone().or(environment.master).or(default),
-            host: config.pose.host.clone(),
-            namespace: config.pose.namespace.clone().or(environment.namespace),
-        }
-    }
-}
-
 /// Nodes of graphs, by master.
 #[derive(Debug, Default)]
 pub(crate) struct Topics {
     ros: Ros,
+    /// The name of the agent's node in ROS.
+    name: String,
     nodes: Mutex<BTreeMap<String, Arc<Node>>>,
 }
 
@@ -98,7 +71,7 @@ impl Target {
              or start the agent with --ros-master",
         )?;
         let namespace = environment.namespace.or_else(|| ros.namespace.clone());
-        let topic = Resolver::new(namespace.as_deref().unwrap_or("/"), &ros.name, [])
+        let topic = Resolver::new(namespace.as_deref().unwrap_or("/"), "probes", [])
             .and_then(|names| names.resolve(&check.name))
             .map_err(|error| error.to_string())?;
         let within = u64::try_from(check.within.as_duration().as_millis()).unwrap_or(u64::MAX);
@@ -107,11 +80,13 @@ impl Target {
 }
 
 impl Topics {
-    pub(crate) fn new(ros: Ros) -> Topics {
-        Topics { ros, nodes: Mutex::default() }
+    pub(crate) fn new(ros: Ros, node: &str) -> Topics {
+        let plain = node.chars().map(|c| if c.is_ascii_alphanumeric() { c } else { '_' });
+        let name = format!("muster_probes_{}", plain.collect::<String>());
+        Topics { ros, name, nodes: Mutex::default() }
     }
 
-    pub(super) fn ros(&self) -> &Ros {
+    pub(crate) fn ros(&self) -> &Ros {
         &self.ros
     }
 
@@ -129,12 +104,12 @@ impl Topics {
             return Ok(Arc::clone(node));
         }
         let options = NodeOptions {
-            name: self.ros.name.clone(),
+            name: self.name.clone(),
             master: Some(master.to_owned()),
             host: self.ros.host.clone(),
             // Names are global already.
             namespace: Some("/".to_owned()),
-            remappings: Vec::new(),
+            ..NodeOptions::default()
         };
         let node = Arc::new(Node::start(options).await.map_err(|error| chain(&error))?);
         nodes.insert(master.to_owned(), Arc::clone(&node));
@@ -214,7 +189,7 @@ mod tests {
     use serde_json::json;
 
     use super::*;
-    use crate::runtime::launch::{AttemptId, Limits, Program};
+    use crate::runtime::launch::{AttemptId, Limits, Network, Program};
 
     fn launch(env: &[(&str, &str)], given: &[(&str, &str)]) -> Launch {
         let pair = |(name, value): &(&str, &str)| ((*name).to_owned(), (*value).to_owned());
@@ -225,7 +200,12 @@ mod tests {
         let variables = given.iter().map(variable).collect();
         Launch {
             id: AttemptId { uid: TaskUid::new("t"), attempt: 1 },
-            program: Program::Process { argv: Vec::new(), working_dir: None, user: None },
+            program: Program::Process {
+                argv: Vec::new(),
+                working_dir: None,
+                user: None,
+                network: Network::Host,
+            },
             env: env.iter().map(pair).collect(),
             given: Some(Arc::new(proto::Config { variables, files: Vec::new(), unresolved: None })),
             limits: Limits::default(),
@@ -242,7 +222,6 @@ mod tests {
     #[test]
     fn the_probe_goes_before_the_task_and_the_task_before_the_agent() {
         let ros = Ros {
-            name: "probes".to_owned(),
             master: Some("http://agent:1".to_owned()),
             namespace: Some("/robot".to_owned()),
             host: None,

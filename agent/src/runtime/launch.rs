@@ -49,6 +49,9 @@ pub(crate) enum Program {
         working_dir: Option<PathBuf>,
         /// `name`, `name:group` or numbers. Absent: the agent's user.
         user: Option<String>,
+        /// Host or None.
+        #[serde(default)]
+        network: Network,
     },
     /// A container.
     Container(Container),
@@ -119,9 +122,10 @@ pub(crate) struct Mount {
     pub(crate) read_only: bool,
 }
 
-/// A container's network.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+/// A program's network.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub(crate) enum Network {
+    #[default]
     Host,
     None,
     Bridge,

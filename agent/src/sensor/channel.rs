@@ -13,6 +13,8 @@ use muster_agent_core::sensor::fan::{Delivery, Fan, GivenUp, NotHeld, Reader};
 use muster_agent_core::sensor::source::{Action, Event, Source, Standing};
 use muster_api::name::FunctionName;
 use muster_api::wire::sensor::v1 as proto;
+use muster_ros1::message::Type;
+use muster_ros1::node::From;
 use tokio::sync::{Notify, watch};
 use tokio_util::sync::CancellationToken;
 
@@ -100,6 +102,8 @@ pub(super) struct Channel {
     /// How many tasks want it.
     demand: watch::Sender<usize>,
     stand: watch::Sender<Stand>,
+    /// What a topic's messages are.
+    kind: Mutex<Option<(Arc<From>, Arc<Type>)>>,
 }
 
 impl Channel {
@@ -117,6 +121,7 @@ impl Channel {
             inner: Mutex::new(inner),
             demand: watch::Sender::default(),
             stand: watch::Sender::default(),
+            kind: Mutex::default(),
         }
     }
 
@@ -233,6 +238,21 @@ impl Channel {
             }
             changes
         });
+    }
+
+    /// The run says what its messages are, by who they are from.
+    pub(super) fn set_kind(&self, from: &Arc<From>) {
+        let mut kind = self.kind.lock().unwrap_or_else(PoisonError::into_inner);
+        if kind.as_ref().is_none_or(|(known, _)| !Arc::ptr_eq(known, from)) {
+            *kind = Some((Arc::clone(from), Arc::new(from.of())));
+            self.set_format(&format!("ros1:{}", from.kind));
+        }
+    }
+
+    /// Of a topic of ROS's, when something has come.
+    pub(super) fn kind(&self) -> Option<Arc<Type>> {
+        let kind = self.kind.lock().unwrap_or_else(PoisonError::into_inner);
+        kind.as_ref().map(|(_, of)| Arc::clone(of))
     }
 
     fn say(&self, source: &Source) {

@@ -11,6 +11,7 @@
 //! |---|---|
 //! | [`settings`] | `sensors` of `agent.yaml` |
 //! | `channel` | one function: its frames, its readers, how it stands |
+//! | [`reading`] | one function as a topic of ROS, for a task with a graph of its own |
 //! | `slot` | pieces of memory that tasks may see and not change |
 //! | `source` | what is read, and how frames are kept apart |
 //! | [`seat`] | one task's sockets |
@@ -24,6 +25,7 @@
 //! task's. Without control groups (`--unenforced-quotas`) it is the token that counts.
 
 mod channel;
+pub(crate) mod reading;
 pub(crate) mod seat;
 pub(crate) mod settings;
 mod slot;
@@ -75,6 +77,16 @@ impl Sensors {
     /// Whether any of these has a source.
     pub(crate) fn serves(&self, functions: &[FunctionName]) -> bool {
         functions.iter().any(|function| self.channels.contains_key(function))
+    }
+
+    /// Those of a task that are topics.
+    pub(crate) fn topics(
+        &self,
+        functions: &[FunctionName],
+        namespace: Option<&str>,
+    ) -> Vec<reading::Topic> {
+        let asked = functions.iter().filter_map(|function| self.channels.get(function));
+        asked.filter_map(|c| reading::Topic::of(c, namespace.unwrap_or("/"))).collect()
     }
 
     /// Reads what tasks want until `end`; returns when nothing is read any more.

@@ -1,6 +1,6 @@
 //! From fork to exec.
 //!
-//! Order in the child: enter the group (while it still has the rights to), new session, user,
+//! Order in the child: enter the group and the network (while it still has the rights to), new session, user,
 //! directory, exec. The program is in its group before its first instruction. A check of a running task (see
 //! [`crate::runtime::process`]) goes the same way, so that it finds what the task's program finds.
 
@@ -15,9 +15,10 @@ use std::process::{Command, Stdio};
 
 use rustix::pipe::PipeFlags;
 
-use crate::runtime::launch::Program;
-use crate::runtime::process::attempt::Order;
+use crate::runtime::launch::{Network, Program};
+use crate::runtime::process::attempt::{Order, Process};
 use crate::runtime::process::reach::mark;
+use crate::runtime::process::scan;
 
 /// A program that runs.
 #[derive(Debug)]
@@ -48,9 +49,10 @@ impl fmt::Display for StartError {
 }
 
 /// Steps in the child, told to the parent by number.
-const STEPS: [&str; 9] = [
+const STEPS: [&str; 10] = [
     "execute",
     "enter its control group",
+    "make its network",
     "make its session",
     "take its groups",
     "become its user",
@@ -86,7 +88,7 @@ pub(super) fn start(
         stderr: child_stderr,
         terminal: false,
     };
-    let child = spawn((order, given), argv, streams, false)?;
+    let child = spawn((order, given), argv, streams, None)?;
     Ok(Started { pid: child.id().cast_signed(), stdout, stderr })
 }
 
@@ -101,14 +103,15 @@ pub(crate) struct Streams {
 }
 
 /// Starts `argv` where and as whom the order's own program was started, with these as its streams. `given`: variables that
-/// are not in the order. `tied`: it is killed when the thread that called this ends.
+/// are not in the order. `beside`: the order's own program, which runs; this one is in its network, and is killed when the
+/// thread that called this ends.
 pub(crate) fn spawn(
     (order, given): (&Order, &BTreeMap<OsString, OsString>),
     argv: &[String],
     streams: Streams,
-    tied: bool,
+    beside: Option<Process>,
 ) -> Result<std::process::Child, StartError> {
-    let Program::Process { working_dir, user, .. } = &order.launch.program else {
+    let Program::Process { working_dir, user, network, .. } = &order.launch.program else {
         return Err(StartError::Order("the order is for a container".to_owned()));
     };
     let Some((program, args)) = argv.split_first() else {
@@ -123,6 +126,17 @@ pub(crate) fn spawn(
             .entrances()
             .map_err(|source| StartError::Step { step: "open its control group", source })?,
         None => Vec::new(),
+    };
+    let place = match (network, beside) {
+        (Network::Host | Network::Bridge, _) => Place::Here,
+        (Network::None, None) => Place::New,
+        (Network::None, Some(process)) => {
+            let open = |which| {
+                scan::namespace(process, which)
+                    .map_err(|source| StartError::Step { step: "find its network", source })
+            };
+            Place::Of([open("net")?, open("ipc")?])
+        }
     };
     let (step_read, step_write) =
         rustix::pipe::pipe_with(PipeFlags::CLOEXEC).map_err(system("make its pipes"))?;
@@ -150,7 +164,8 @@ pub(crate) fn spawn(
         dir: CString::new(dir.as_os_str().as_encoded_bytes())
             .map_err(|_| StartError::Order("the working directory holds a zero byte".to_owned()))?,
         step: step_write.as_raw_fd(),
-        tied_to: tied.then(std::process::id).map(u32::cast_signed),
+        tied_to: beside.map(|_| std::process::id().cast_signed()),
+        place,
     };
     // SAFETY: `Child::enter` makes only async-signal-safe system calls on memory made above.
     unsafe { command.pre_exec(move || child.enter()) };
@@ -173,7 +188,7 @@ fn failed_step(
     let what = STEPS.get(step).copied().unwrap_or(STEPS[0]);
     match step {
         0 => StartError::Order(format!("failed to {what} {program:?}: {source}")),
-        5 => StartError::Order(format!("failed to {what} {}: {source}", dir.display())),
+        6 => StartError::Order(format!("failed to {what} {}: {source}", dir.display())),
         _ => StartError::Step { step: what, source },
     }
 }
@@ -188,12 +203,42 @@ struct Child {
     terminal: bool,
     /// The process whose end is its end.
     tied_to: Option<i32>,
+    place: Place,
+}
+
+/// Which network the child is in.
+enum Place {
+    /// That of whoever starts it.
+    Here,
+    /// One of its own, with a loopback.
+    New,
+    /// Another's: the namespaces.
+    Of([OwnedFd; 2]),
+}
+
+/// The loopback of a new network is down, and without it there is no 127.0.0.1.
+fn raise_loopback() -> bool {
+    // SAFETY: a request that is all zeros is one; the name fits with its end, and both calls read and write that request alone.
+    unsafe {
+        let mut request = std::mem::zeroed::<libc::ifreq>();
+        for (to, from) in request.ifr_name.iter_mut().zip(*b"lo") {
+            *to = libc::c_char::from_ne_bytes([from]);
+        }
+        let socket = libc::socket(libc::AF_INET, libc::SOCK_DGRAM | libc::SOCK_CLOEXEC, 0);
+        if socket == -1 || libc::ioctl(socket, libc::SIOCGIFFLAGS, &raw mut request) == -1 {
+            return false;
+        }
+        request.ifr_ifru.ifru_flags |= libc::IFF_UP as libc::c_short;
+        libc::ioctl(socket, libc::SIOCSIFFLAGS, &raw const request) != -1
+            && libc::close(socket) == 0
+    }
 }
 
 impl Child {
     fn enter(&self) -> io::Result<()> {
         for (step, done) in (1_u8..).zip([
             Child::enter_group as fn(&Child) -> bool,
+            Child::enter_network,
             Child::make_session,
             Child::take_groups,
             Child::become_user,
@@ -215,6 +260,17 @@ impl Child {
     fn enter_group(&self) -> bool {
         // SAFETY: live descriptors and one static byte. "0" is the writer itself.
         self.entrances.iter().all(|fd| unsafe { libc::write(*fd, c"0".as_ptr().cast(), 1) } == 1)
+    }
+
+    fn enter_network(&self) -> bool {
+        // SAFETY: numbers only, and live descriptors.
+        match &self.place {
+            Place::Here => true,
+            Place::New => unsafe {
+                libc::unshare(libc::CLONE_NEWNET | libc::CLONE_NEWIPC) == 0 && raise_loopback()
+            },
+            Place::Of(both) => both.iter().all(|of| unsafe { libc::setns(of.as_raw_fd(), 0) } == 0),
+        }
     }
 
     /// With a terminal of its own, which belongs to whom the program will be.

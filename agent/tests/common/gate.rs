@@ -40,6 +40,7 @@ pub fn command(id: u64, lease: &str, data: &str) -> Say {
         lease: Some(self::lease(lease)),
         actuator: "base:Drive".to_owned(),
         data: data.to_owned().into(),
+        ..Default::default()
     })
 }
 

@@ -119,7 +119,8 @@ impl Gate {
         let (lease, data) = (Some(self.lease.clone()), data.into());
         self.id += 1;
         let (id, actuator) = (self.id, actuator.to_owned());
-        self.ask(Call::Command(proto::Command { id, lease, actuator, data })).await
+        self.ask(Call::Command(proto::Command { id, lease, actuator, data, format: String::new() }))
+            .await
     }
 
     /// Says that this program lives, while it does not move the robot.

@@ -111,7 +111,12 @@ async fn open(
         return Err(LinkError::Refused(error.to_owned()));
     }
     let field = |key| answer.get(key).unwrap_or_default().to_owned();
-    let from = From { caller: field("callerid"), kind: field("type"), md5: field("md5sum") };
+    let from = From {
+        caller: field("callerid"),
+        kind: field("type"),
+        md5: field("md5sum"),
+        definition: field("message_definition"),
+    };
     let fits = |wanted: &str, found: &str| wanted == "*" || found == "*" || wanted == found;
     if !fits(subscription.md5(), &from.md5) {
         return Err(LinkError::OtherType {

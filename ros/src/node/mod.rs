@@ -6,20 +6,25 @@
 //! | `slave` | the API that the master and other nodes call |
 //! | `subscription` | a task a topic, and one below it for each publisher: `link` |
 //! | `publication` | a task for all who connect, and one for each subscriber |
+//! | `outbox` | what waits for one subscriber |
+//! | `unread` | what it was sent and has not read |
 //! | `bus` | every connection, for `rosnode info` |
 
 mod bus;
 mod link;
+mod outbox;
 mod publication;
 mod registrar;
 mod slave;
 mod subscription;
+mod unread;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::io;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
+use bytes::Bytes;
 use tokio::net::TcpListener;
 use tokio::sync::{Notify, watch};
 use tokio_util::task::AbortOnDropHandle;
@@ -32,7 +37,7 @@ pub use subscription::{
 
 use crate::env::{self, Environment};
 use crate::master::Master;
-use crate::message::Message;
+use crate::message::{Message, Type, describe};
 use crate::name::{NameError, Resolver};
 use crate::xmlrpc::Value;
 use crate::xmlrpc::http::{Uri, UriError, serve};
@@ -56,6 +61,8 @@ pub struct NodeOptions {
     pub namespace: Option<String>,
     /// Names that are replaced: from, to.
     pub remappings: Vec<(String, String)>,
+    /// Whoever wants this node to end (anybody may say so) is refused.
+    pub stays: bool,
 }
 
 /// Why a node does not start, or does not take a topic.
@@ -104,6 +111,8 @@ pub(crate) struct Shared {
     /// side, and a registration that was under way could come after.
     turn: tokio::sync::Mutex<()>,
     state: watch::Sender<MasterState>,
+    /// Nobody may end it from afar.
+    stays: bool,
     /// Why somebody wanted this node to end.
     ended: watch::Sender<Option<String>>,
 }
@@ -204,6 +213,7 @@ impl Node {
             work: Notify::new(),
             turn: tokio::sync::Mutex::new(()),
             state: watch::Sender::new(MasterState::Unknown),
+            stays: options.stays,
             ended: watch::Sender::new(None),
         });
         let slave = Arc::new(slave::Slave(Arc::clone(&shared)));
@@ -347,17 +357,42 @@ impl Node {
         topic: &str,
         options: PublishOptions,
     ) -> Result<Publisher<M>, NodeError> {
+        let publication = self.publish(topic, describe::<M>().into(), options)?;
+        Ok(Publisher::new(publication, Arc::clone(&self.shared)))
+    }
+
+    /// Publishes a topic of messages that are serialised already.
+    ///
+    /// # Errors
+    ///
+    /// As [`Node::advertise`].
+    pub fn advertise_any(
+        &self,
+        topic: &str,
+        of: Type,
+        options: PublishOptions,
+    ) -> Result<Publisher<Bytes>, NodeError> {
+        let publication = self.publish(topic, of, options)?;
+        Ok(Publisher::new(publication, Arc::clone(&self.shared)))
+    }
+
+    fn publish(
+        &self,
+        topic: &str,
+        of: Type,
+        options: PublishOptions,
+    ) -> Result<Arc<Publication>, NodeError> {
         let topic = self.names.resolve(topic)?;
         let mut topics = self.shared.topics();
         if topics.publications.contains_key(&topic) {
             return Err(NodeError::Twice { what: "publishes", topic });
         }
         topics.leaving.remove(&Leaving::Publication(topic.clone()));
-        let publication = Arc::new(Publication::new::<M>(topic.clone(), options));
+        let publication = Arc::new(Publication::new(topic.clone(), of, options));
         topics.publications.insert(topic, Arc::clone(&publication));
         drop(topics);
         self.shared.work.notify_one();
-        Ok(Publisher::new(publication, Arc::clone(&self.shared)))
+        Ok(publication)
     }
 
     /// Follows a parameter; `None` while it is not set, or not known yet.

@@ -7,24 +7,22 @@ use std::sync::{Arc, Mutex, Weak};
 use std::time::Duration;
 
 use bytes::Bytes;
-use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
+use tokio::io::AsyncWriteExt as _;
 use tokio::net::{TcpListener, TcpStream};
-use tokio::sync::Semaphore;
+use tokio::sync::{Semaphore, watch};
 use tokio::task::JoinSet;
 use tokio_util::sync::CancellationToken;
 
 use super::bus::Direction;
+use super::outbox::Outbox;
 use super::{Leaving, Shared, lock};
-use crate::message::Message;
-use crate::queue::Queue;
+use crate::message::{Message, Type};
 use crate::tcpros::{Header, LARGEST_HEADER, length, read_frame};
 
 /// Subscribers of a node at once.
 const MOST: usize = 256;
 /// For a subscriber's header.
 const PATIENCE: Duration = Duration::from_secs(10);
-/// A subscriber that reads nothing for this long is gone, or frozen: it may connect again.
-const STALLED: Duration = Duration::from_secs(30);
 
 /// How a topic is published.
 #[derive(Debug, Clone)]
@@ -33,43 +31,53 @@ pub struct PublishOptions {
     pub queue: usize,
     /// Who connects later is given the last message.
     pub latch: bool,
+    /// Who connects is given this serialised message first.
+    pub greeting: Option<Bytes>,
+    /// A subscriber is given a message when it has read those before, as far as that is known ([`Publisher::is_delivered`]): what
+    /// waits for a slow one gives way to what is newer, and to what goes first.
+    pub paced: bool,
 }
 
 impl Default for PublishOptions {
     fn default() -> Self {
-        PublishOptions { queue: 10, latch: false }
+        PublishOptions { queue: 10, latch: false, greeting: None, paced: false }
     }
 }
 
 #[derive(Debug)]
 pub(crate) struct Publication {
     topic: String,
-    kind: &'static str,
-    md5: &'static str,
-    definition: &'static str,
+    of: Type,
     options: PublishOptions,
     registered: AtomicBool,
     readers: Mutex<Readers>,
+    /// The names of those who are connected.
+    callers: watch::Sender<Vec<String>>,
     /// It is not published any more.
     closed: CancellationToken,
 }
 
 #[derive(Debug, Default)]
 struct Readers {
-    queues: Vec<Weak<Queue<Bytes>>>,
+    all: Vec<Reader>,
     last: Option<Bytes>,
 }
 
+#[derive(Debug)]
+struct Reader {
+    caller: String,
+    outbox: Weak<Outbox>,
+}
+
 impl Publication {
-    pub(super) fn new<M: Message>(topic: String, options: PublishOptions) -> Self {
+    pub(super) fn new(topic: String, of: Type, options: PublishOptions) -> Self {
         Publication {
             topic,
-            kind: M::TYPE,
-            md5: M::MD5,
-            definition: M::DEFINITION,
+            of,
             options,
             registered: AtomicBool::new(false),
             readers: Mutex::default(),
+            callers: watch::Sender::default(),
             closed: CancellationToken::new(),
         }
     }
@@ -78,8 +86,8 @@ impl Publication {
         &self.topic
     }
 
-    pub(super) fn kind(&self) -> &'static str {
-        self.kind
+    pub(super) fn kind(&self) -> &str {
+        &self.of.name
     }
 
     pub(super) fn is_registered(&self) -> bool {
@@ -90,15 +98,40 @@ impl Publication {
         self.registered.store(registered, Ordering::Release);
     }
 
-    /// A subscriber's queue, with the last message in it when there is one to keep.
-    fn join(&self) -> Arc<Queue<Bytes>> {
-        let queue = Arc::new(Queue::new(self.options.queue));
+    /// What waits for a subscriber, with the messages in it that come first.
+    fn join(self: &Arc<Self>, caller: &str, stream: TcpStream) -> Joined {
+        let outbox = Arc::new(Outbox::new(stream, self.options.queue, self.options.paced));
         let mut readers = lock(&self.readers);
-        if let Some(last) = &readers.last {
-            queue.push(last.clone());
+        if let Some(greeting) = &self.options.greeting {
+            outbox.push_urgent(framed(greeting));
         }
-        readers.queues.push(Arc::downgrade(&queue));
-        queue
+        if let Some(last) = &readers.last {
+            outbox.push(last.clone());
+        }
+        let caller = caller.to_owned();
+        readers.all.push(Reader { caller: caller.clone(), outbox: Arc::downgrade(&outbox) });
+        // While the list is held: who counts the callers misses nobody who is in it.
+        self.callers.send_modify(|callers| callers.push(caller.clone()));
+        Joined { outbox, caller, publication: Arc::clone(self) }
+    }
+
+    /// Gives a frame to all who are connected.
+    fn send(&self, frame: &Bytes, urgent: bool) {
+        let mut readers = lock(&self.readers);
+        readers.all.retain(|reader| match reader.outbox.upgrade() {
+            Some(outbox) if urgent => {
+                outbox.push_urgent(frame.clone());
+                true
+            }
+            Some(outbox) => {
+                outbox.push(frame.clone());
+                true
+            }
+            None => false,
+        });
+        if self.options.latch {
+            readers.last = Some(frame.clone());
+        }
     }
 
     /// Why a subscriber with this header is not taken.
@@ -108,12 +141,10 @@ impl Publication {
         if header.get("md5sum").is_none() || header.get("callerid").is_none() {
             return Some("the connection header lacks md5sum or callerid".to_owned());
         }
-        if !fits("type", self.kind) || !fits("md5sum", self.md5) {
+        if !fits("type", &self.of.name) || !fits("md5sum", &self.of.md5) {
             let theirs = header.get("type").unwrap_or_default();
-            return Some(format!(
-                "{} is of type {} [{}], not {theirs}",
-                self.topic, self.kind, self.md5
-            ));
+            let Type { name, md5, .. } = &self.of;
+            return Some(format!("{} is of type {name} [{md5}], not {theirs}", self.topic));
         }
         None
     }
@@ -122,12 +153,33 @@ impl Publication {
         Header::new([
             ("callerid", caller),
             ("latching", if self.options.latch { "1" } else { "0" }),
-            ("md5sum", self.md5),
-            ("message_definition", self.definition),
+            ("md5sum", &*self.of.md5),
+            ("message_definition", &*self.of.definition),
             ("topic", &*self.topic),
-            ("type", self.kind),
+            ("type", &*self.of.name),
         ])
     }
+}
+
+/// A subscriber while it is connected.
+struct Joined {
+    outbox: Arc<Outbox>,
+    caller: String,
+    publication: Arc<Publication>,
+}
+
+impl Drop for Joined {
+    fn drop(&mut self) {
+        self.publication.callers.send_modify(|callers| {
+            let mine = callers.iter().position(|caller| *caller == self.caller);
+            drop(mine.map(|at| callers.swap_remove(at)));
+        });
+    }
+}
+
+/// A message with its length before it.
+fn framed(body: &[u8]) -> Bytes {
+    [&length(body.len()), body].concat().into()
 }
 
 /// Takes subscribers until dropped.
@@ -176,25 +228,10 @@ async fn attend(mut stream: TcpStream, shared: &Shared) {
         return;
     }
     connection.set_connected(true);
-    let queue = publication.join();
-    let (mut from, mut to) = stream.split();
-    let write = async {
-        loop {
-            let frame = queue.pop().await;
-            match tokio::time::timeout(STALLED, to.write_all(&frame)).await {
-                Ok(Ok(())) => connection.passed(frame.len()),
-                _ => return,
-            }
-        }
-    };
-    // Subscribers say nothing: what comes is their end.
-    let closed = async {
-        let mut nothing = [0; 64];
-        while from.read(&mut nothing).await.is_ok_and(|read| read > 0) {}
-    };
+    let joined = publication.join(caller, stream);
     tokio::select! {
-        () = write => {}
-        () = closed => {}
+        () = joined.outbox.send(|length| connection.passed(length)) => {}
+        () = joined.outbox.closed() => {}
         () = publication.closed.cancelled() => {}
     }
 }
@@ -207,44 +244,68 @@ pub struct Publisher<M> {
     message: PhantomData<fn(M)>,
 }
 
-impl<M: Message> Publisher<M> {
+impl<M> Publisher<M> {
     pub(super) fn new(publication: Arc<Publication>, shared: Arc<Shared>) -> Self {
         Publisher { publication, shared, message: PhantomData }
     }
 
-    /// Gives a message to all who are connected; waits for nobody.
-    pub fn publish(&self, message: &M) {
-        let mut readers = lock(&self.publication.readers);
-        readers.queues.retain(|queue| queue.strong_count() > 0);
-        let latch = self.publication.options.latch;
-        if readers.queues.is_empty() && !latch {
-            return;
-        }
-        let mut frame = vec![0; 4];
-        message.write(&mut frame);
-        let size = length(frame.len() - 4);
-        frame[..4].copy_from_slice(&size);
-        let frame = Bytes::from(frame);
-        readers.queues.iter().filter_map(Weak::upgrade).for_each(|queue| queue.push(frame.clone()));
-        if latch {
-            readers.last = Some(frame);
-        }
-    }
-
-    /// Who is connected.
+    /// How many are connected.
     #[must_use]
     pub fn subscribers(&self) -> usize {
-        lock(&self.publication.readers)
-            .queues
-            .iter()
-            .filter(|queue| queue.strong_count() > 0)
-            .count()
+        self.publication.callers.borrow().len()
+    }
+
+    /// The names of those who are connected, as they say them.
+    #[must_use]
+    pub fn callers(&self) -> watch::Receiver<Vec<String>> {
+        self.publication.callers.subscribe()
     }
 
     /// The topic's global name.
     #[must_use]
     pub fn topic(&self) -> &str {
         &self.publication.topic
+    }
+
+    /// Registers with the master once more, which tells all subscribers again who publishes the topic.
+    pub fn announce(&self) {
+        self.publication.set_registered(false);
+        self.shared.work.notify_one();
+    }
+}
+
+impl<M: Message> Publisher<M> {
+    /// Gives a message to all who are connected; waits for nobody.
+    pub fn publish(&self, message: &M) {
+        if self.subscribers() == 0 && !self.publication.options.latch {
+            return;
+        }
+        let mut frame = vec![0; 4];
+        message.write(&mut frame);
+        let size = length(frame.len() - 4);
+        frame[..4].copy_from_slice(&size);
+        self.publication.send(&frame.into(), false);
+    }
+}
+
+impl Publisher<Bytes> {
+    /// Gives a serialised message to all who are connected; waits for nobody.
+    pub fn publish(&self, body: &[u8]) {
+        self.publication.send(&framed(body), false);
+    }
+
+    /// The same before all that waits, which is dropped.
+    pub fn publish_first(&self, body: &[u8]) {
+        self.publication.send(&framed(body), true);
+    }
+
+    /// Whether those who are connected, or `only` that one, have everything: on this machine and in its network the program, of
+    /// one elsewhere its machine; what a program there has read is not known.
+    #[must_use]
+    pub fn is_delivered(&self, only: Option<&str>) -> bool {
+        let readers = lock(&self.publication.readers);
+        let mut asked = readers.all.iter().filter(|r| only.is_none_or(|only| only == r.caller));
+        asked.all(|reader| reader.outbox.upgrade().is_none_or(|outbox| outbox.is_delivered()))
     }
 }
 

@@ -67,6 +67,15 @@ impl Slave {
     fn shutdown(&self, params: &[Value]) -> Outcome {
         let who = text(params, 0, "caller_id")?;
         let why = params.get(1).and_then(Value::as_str).unwrap_or_default();
+        if self.0.stays {
+            tracing::warn!(
+                node = self.0.name,
+                who,
+                why,
+                "somebody wants this ROS node to end; it stays"
+            );
+            return Err(format!("{} does not end for others", self.0.name));
+        }
         tracing::warn!(node = self.0.name, who, why, "somebody wants this ROS node to end");
         self.0.ended.send_replace(Some(format!("{who} ended it: {why}")));
         Ok(Value::Int(0))

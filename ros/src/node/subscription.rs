@@ -13,7 +13,7 @@ use tokio_util::task::AbortOnDropHandle;
 
 use super::link::attend;
 use super::{Leaving, Shared, lock};
-use crate::message::Message;
+use crate::message::{Message, Type};
 use crate::queue::Queue;
 use crate::rate::RateMeter;
 use crate::tcpros::LARGEST_FRAME;
@@ -44,6 +44,17 @@ pub struct From {
     pub kind: String,
     /// The type's checksum.
     pub md5: String,
+    /// The type's definition; empty when the publisher does not say it.
+    pub definition: String,
+}
+
+impl From {
+    /// The type of its messages.
+    #[must_use]
+    pub fn of(&self) -> Type {
+        let From { kind, md5, definition, .. } = self.clone();
+        Type { name: kind, md5, definition }
+    }
 }
 
 /// A message as it came.

@@ -4,6 +4,7 @@
 //! numbers mean little: every figure that touches it is a ratio, and `fdatasync` is measured before
 //! and after. When the two differ by more than 2×, the figure is printed as void.
 
+mod fence;
 mod floor;
 mod footprint;
 mod herd;
@@ -57,6 +58,11 @@ const FIGURES: &[Figure] = &[
         "pose",
         "a robot's pose from rospy's publish to the controller, against a bare subscriber",
         || Box::pin(ros::pose()),
+    ),
+    (
+        "fence",
+        "a ROS driver's stop after its gate was killed; the holder's stream under attack",
+        || Box::pin(fence::all()),
     ),
     ("sensors", "a camera of 1 MB and 30 Hz for 1, 8, 64 tasks, against copies and ROS", || {
         Box::pin(sensors::all())

@@ -68,7 +68,7 @@ async fn node(master: &str, name: &str) -> Node {
 
 async fn publish(master: &str) {
     let node = node(master, "camera").await;
-    let topic = node.advertise::<Image>(TOPIC, PublishOptions { queue: 1, latch: false });
+    let topic = node.advertise::<Image>(TOPIC, PublishOptions { queue: 1, ..Default::default() });
     let topic = topic.expect("a topic");
     let image = Image { data: vec![0; SIZE].into(), ..Image::default() };
     let mut ticks = tokio::time::interval(Duration::from_secs_f64(HZ.recip()));

@@ -54,7 +54,7 @@ tests! {
     lost_shims: tasks::shim_lost => LostShimExit;
 
     works: executor::works => WorkRecord;
-    gates_simulators_and_sensors: robot::robot => SensorStatus, GateSettings, SimWorld, GateRecord, SimRobot;
+    gates_simulators_and_sensors: robot::robot => SensorStatus, RosView, GateSettings, SimWorld, GateRecord, SimRobot;
 
     containers: containers::to_its_end => ContainerCreation, ContainerStart, ContainerRemoval;
     guards: containers::guarded => GuardOrder, Disconnected;

@@ -1,4 +1,4 @@
-//! A simulated robot: its gate, its simulator, and a task that drives it and reads a sensor.
+//! A simulated robot: its gate, its simulator, and a task that drives it, reads a sensor and has a graph of ROS.
 
 use muster_api::phase::TaskPhase;
 use muster_failpoint::Failpoint;
@@ -49,6 +49,7 @@ pub(crate) async fn robot(points: &[Failpoint]) {
         cluster.spawn_agent("robot", None);
         let name = format!("t{number}");
         let spec = json!({
+            "ros": {"master": "View"},
             "resources": {"actuators": ["base:Drive"], "sensors": ["kinect:LaserGen"]},
             "run": {"process": {"command": ["sleep", "1000"]}},
             "gracePeriodSeconds": 0,

@@ -1,5 +1,8 @@
 use bytes::Bytes;
 use muster_ros1::Message;
+use muster_ros1::layout::Layout;
+use muster_ros1::message::describe;
+use muster_ros1::registry::Registry;
 use muster_ros1::tcpros::Header;
 use muster_ros1::wire::Wire;
 use muster_ros1::xmlrpc;
@@ -24,6 +27,19 @@ fn calls_and_answers_are_read_as_they_are_written() {
 }
 
 #[test]
+fn a_master_answers_whatever_is_said() {
+    let inputs = muster_hostile::inputs("xmlrpc");
+    muster_hostile::feed(bolero::check!(), inputs, |bytes| {
+        let Ok(call) = xmlrpc::call(&String::from_utf8_lossy(bytes)) else { return };
+        let mut master = Registry::new("http://127.0.0.1:11311/", 1);
+        let first = master.handle(&call);
+        // Whoever it was, others are answered still.
+        let state = xmlrpc::Call { method: "getSystemState".into(), params: vec!["/x".into()] };
+        assert!(master.handle(&state).answer.is_ok(), "{first:?}");
+    });
+}
+
+#[test]
 fn connection_headers_are_read_as_they_are_written() {
     let subscriber = Header::new([
         ("callerid", "/listener"),
@@ -42,6 +58,8 @@ fn connection_headers_are_read_as_they_are_written() {
 
 /// What decodes is encoded so that it decodes the same.
 fn there_and_back<M: Message + std::fmt::Debug>(bytes: &Bytes) {
+    let layout = Layout::of(&describe::<M>());
+    assert_eq!(layout.check(bytes).is_ok(), M::decode(bytes.clone()).is_ok(), "{}", M::TYPE);
     if let Ok(message) = M::decode(bytes.clone()) {
         let again = M::decode(message.encode().into()).expect("it is one of ours");
         assert_eq!(format!("{again:?}"), format!("{message:?}"), "{}", M::TYPE);

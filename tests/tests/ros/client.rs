@@ -69,7 +69,10 @@ async fn rostopic_and_this_client_read_each_other() {
     let ros = Ros::start().await;
     let node = node(&ros, "talker").await;
     let publisher = node
-        .advertise::<PointStamped>("/clicked", PublishOptions { latch: true, queue: 1 })
+        .advertise::<PointStamped>(
+            "/clicked",
+            PublishOptions { latch: true, queue: 1, ..Default::default() },
+        )
         .unwrap();
     let header = Header {
         seq: 0,

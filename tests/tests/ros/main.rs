@@ -1,6 +1,11 @@
-//! Our ROS 1 client, and the agent's poses and sensors, against Debian's ROS 1: roscore, rospy, rostopic, rosnode.
+//! Our ROS 1 client and master, and the agent's poses, sensors, drivers and tasks, against Debian's ROS 1: roscore, rospy, rostopic, rosnode.
 
+mod attacks;
 mod client;
+mod gate;
+mod master;
 mod pose;
 mod probes;
 mod sensors;
+mod tasks;
+mod view;

@@ -87,7 +87,7 @@ impl Reader {
             master: self.settings.master.clone(),
             host: self.settings.host.clone(),
             namespace: self.settings.namespace.clone(),
-            remappings: Vec::new(),
+            ..NodeOptions::default()
         };
         Node::start(options).await.map_err(|error| chain(&error))
     }

@@ -16,7 +16,7 @@ use rustix::pipe::PipeFlags;
 use rustix::process::{Pid, PidfdFlags, Signal};
 use tokio::sync::oneshot;
 
-use super::attempt::{AttemptDir, Order};
+use super::attempt::{AttemptDir, Order, Process};
 use super::scan;
 use crate::runtime::{Executed, KEPT_WORDS, RuntimeError};
 use crate::shim::start::{self, StartError, Streams};
@@ -68,7 +68,8 @@ fn run(dir: &AttemptDir, argv: &[String], cut: &OwnedFd) -> Result<Executed, Run
     let both = (child_output.try_clone().map_err(failed)?, child_output);
     let (stdout, stderr) = both;
     let streams = Streams { stdin: Stdio::null(), stdout, stderr, terminal: false };
-    let child = match start::spawn((&order, &variables(dir)), argv, streams, true) {
+    let beside = beside(dir).ok_or_else(|| RuntimeError::new(WHAT, "it does not run"))?;
+    let child = match start::spawn((&order, &variables(dir)), argv, streams, Some(beside)) {
         Ok(child) => child,
         Err(error @ StartError::Order(_)) => return Ok(Executed::NotStarted(error.to_string())),
         Err(error) => return Err(failed(io::Error::other(error.to_string()))),
@@ -77,11 +78,15 @@ fn run(dir: &AttemptDir, argv: &[String], cut: &OwnedFd) -> Result<Executed, Run
     attend(child, &mut words, cut).map_err(failed)
 }
 
+/// The attempt's own program.
+pub(super) fn beside(dir: &AttemptDir) -> Option<Process> {
+    dir.running().ok().flatten().map(|running| running.process)
+}
+
 /// The variables that the attempt's program was started with: those that it was given of ConfigMaps and Secrets are in no
 /// file.
 pub(super) fn variables(dir: &AttemptDir) -> BTreeMap<OsString, OsString> {
-    let running = dir.running().ok().flatten().map(|running| running.process);
-    running.map(scan::variables).unwrap_or_default()
+    beside(dir).map(scan::variables).unwrap_or_default()
 }
 
 /// What the program says, as far as it is kept.

@@ -22,7 +22,7 @@ use tokio::sync::oneshot;
 use tokio_util::sync::CancellationToken;
 
 use super::attempt::AttemptDir;
-use super::exec::{GONE_AFTER, STACK, variables};
+use super::exec::{GONE_AFTER, STACK, beside, variables};
 use super::{pty, scan};
 use crate::exec::ends::{CHUNK, Ends, Input, Invocation, Outlet, Ran, Stream};
 use crate::runtime::RuntimeError;
@@ -228,7 +228,8 @@ fn run(
         given.entry("TERM".into()).or_insert_with(|| "xterm".into());
     }
     let failed = |error: io::Error| RuntimeError::new(WHAT, error);
-    match start::spawn((&order, &given), argv, theirs, true) {
+    let beside = beside(dir).ok_or_else(|| RuntimeError::new(WHAT, "it does not run"))?;
+    match start::spawn((&order, &given), argv, theirs, Some(beside)) {
         Ok(child) => attend(child, cut).map_err(failed),
         Err(error @ StartError::Order(_)) => Ok(Ran::NotStarted(error.to_string())),
         Err(error) => Err(failed(io::Error::other(error.to_string()))),

@@ -51,8 +51,8 @@ use tokio::io::AsyncReadExt;
 use tokio::io::unix::AsyncFd;
 
 use super::cgroup::{Enforcer, Kernel};
-use super::launch::{AttemptId, Launch, Limits, Used};
-use super::{Executed, Launched, LogQuery, Runtime, RuntimeError, RuntimeStatus, logs};
+use super::launch::{AttemptId, Launch, Limits, Network, Program, Used};
+use super::{Executed, Launched, LogQuery, Reached, Runtime, RuntimeError, RuntimeStatus, logs};
 use crate::clock;
 use crate::durable;
 use crate::exec::ends::{Ends, Invocation, Ran};
@@ -422,6 +422,21 @@ impl Runtime for ProcessRuntime {
         until: BoxFuture<'a, ()>,
     ) -> BoxFuture<'a, Result<Executed, RuntimeError>> {
         exec::exec(self.0.dir(&launch.id), argv, until).boxed()
+    }
+
+    fn network<'a>(&'a self, launch: &'a Launch) -> BoxFuture<'a, Result<Reached, RuntimeError>> {
+        let reached = match &launch.program {
+            Program::Process { network: Network::None, .. } => {
+                let error = |error: io::Error| RuntimeError::new("enter a task's network", error);
+                let process = exec::beside(&self.0.dir(&launch.id));
+                let process = process.ok_or_else(|| error(io::ErrorKind::NotFound.into()));
+                process.and_then(|process| {
+                    scan::namespace(process, "net").map(Reached::Inside).map_err(error)
+                })
+            }
+            _ => Ok(Reached::Here),
+        };
+        futures::future::ready(reached).boxed()
     }
 
     fn has_processes(&self) -> bool {

@@ -3,6 +3,8 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::ffi::OsString;
 use std::fs;
+use std::io;
+use std::os::fd::OwnedFd;
 use std::os::unix::ffi::OsStringExt as _;
 
 use super::attempt::Process;
@@ -39,6 +41,16 @@ pub(crate) fn process(pid: i32) -> Option<Process> {
 /// Whether exactly this process exists (a zombie does not).
 pub(crate) fn is_alive(process: Process) -> bool {
     stat(process.pid).is_some_and(|stat| stat.start_time == process.start_time && !stat.zombie)
+}
+
+/// A namespace that a process is in, `net` or `ipc`.
+pub(crate) fn namespace(process: Process, which: &str) -> io::Result<OwnedFd> {
+    let opened = fs::File::open(format!("/proc/{}/ns/{which}", process.pid))?;
+    // Looked at after it was opened: it is this process's, and not that of a later one with its number.
+    match is_alive(process) {
+        true => Ok(opened.into()),
+        false => Err(io::Error::new(io::ErrorKind::NotFound, "it does not run")),
+    }
 }
 
 fn all() -> BTreeMap<i32, Stat> {

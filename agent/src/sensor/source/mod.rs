@@ -48,7 +48,7 @@ impl Context {
             master: self.master.clone(),
             host: self.host.clone(),
             namespace: self.namespace.clone(),
-            remappings: Vec::new(),
+            ..NodeOptions::default()
         }
     }
 }

@@ -75,7 +75,7 @@ async fn next(pace: &Pace, topic: &mut Subscriber<Incoming>) -> Incoming {
 fn publish(channel: &Channel, incoming: &Incoming) -> Result<(), String> {
     let mut blank = channel.blank(incoming.body.len())?;
     blank.bytes().copy_from_slice(&incoming.body);
-    channel.set_format(&format!("ros1:{}", incoming.from.kind));
+    channel.set_kind(&incoming.from);
     channel.publish(blank);
     Ok(())
 }

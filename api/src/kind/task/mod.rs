@@ -4,6 +4,7 @@ pub mod config;
 pub mod depend;
 pub mod probe;
 pub mod reschedule;
+pub mod ros;
 pub(super) mod rules;
 #[cfg(test)]
 mod tests;
@@ -18,6 +19,7 @@ use serde::{Deserialize, Serialize};
 
 pub use config::{EnvFrom, EnvSource, Files};
 pub use reschedule::{EarlierTry, Outlook, Over, Reschedule};
+pub use ros::RosSpec;
 
 use super::node::{NodeKind, Taint, TaintEffect};
 use super::{KindInfo, admit_spec};
@@ -60,6 +62,9 @@ pub struct TaskSpec {
     /// The program.
     #[serde(default)]
     pub run: Run,
+    /// The ROS that it belongs to; none: its environment says nothing of ROS.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub ros: Option<RosSpec>,
     /// Tells whether it can serve: it is Ready while this succeeds. None: it is Ready when it runs.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub readiness: Option<probe::Probe>,
@@ -431,6 +436,26 @@ pub struct ProcessRun {
     /// The user it runs as, a name or a number; none: the agent's.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub user: Option<String>,
+    /// Its network: the node's, or none but a loopback of its own, so that it reaches nobody and is reached by nobody. A
+    /// program that is to be held in needs a `user`, too: root can leave.
+    #[serde(default, skip_serializing_if = "ProcessNetwork::is_default")]
+    pub network: ProcessNetwork,
+}
+
+/// A program's network.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+pub enum ProcessNetwork {
+    /// The node's own network.
+    #[default]
+    Host,
+    /// Loopback only; shared memory and message queues of System V are its own as well.
+    None,
+}
+
+impl ProcessNetwork {
+    fn is_default(&self) -> bool {
+        *self == ProcessNetwork::default()
+    }
 }
 
 /// A variable of a task's environment.

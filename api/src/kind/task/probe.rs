@@ -252,14 +252,19 @@ fn http_rules(http: &HttpCheck, path: &str, violations: &mut Violations) {
     }
 }
 
-fn topic_rules(topic: &TopicCheck, path: &str, violations: &mut Violations) {
-    let name = &topic.name;
+/// Whether this is a global or relative name of ROS.
+pub(super) fn is_topic(name: &str) -> bool {
     let part = |part: &str| {
         let mut letters = part.chars();
         letters.next().is_some_and(|first| first.is_ascii_alphabetic() || first == '_')
             && letters.all(|c| c.is_ascii_alphanumeric() || c == '_')
     };
-    if !name.strip_prefix('/').unwrap_or(name).split('/').all(part) {
+    name.strip_prefix('/').unwrap_or(name).split('/').all(part)
+}
+
+fn topic_rules(topic: &TopicCheck, path: &str, violations: &mut Violations) {
+    let name = &topic.name;
+    if !is_topic(name) {
         let private = name.starts_with('~');
         let reason = format!("{name:?} is not the name of a ROS topic");
         violations.invalid(format!("{path}.name"), reason).suggest(if private {
@@ -295,7 +300,7 @@ fn topic_rules(topic: &TopicCheck, path: &str, violations: &mut Violations) {
     }
 }
 
-fn is_master(text: &str) -> bool {
+pub(super) fn is_master(text: &str) -> bool {
     let rest = text.strip_prefix("http://").map(|rest| rest.strip_suffix('/').unwrap_or(rest));
     let parts = rest.and_then(|rest| rest.rsplit_once(':'));
     parts.is_some_and(|(host, port)| {

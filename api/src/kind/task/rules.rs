@@ -15,6 +15,7 @@ pub(in crate::kind) fn rules(spec: &TaskSpec, violations: &mut Violations) {
     placement_rules(spec, violations);
     resource_rules(&spec.resources, violations);
     run_rules(&spec.run, violations);
+    super::ros::rules(spec, violations);
     super::probe::rules(spec, violations);
     super::depend::rules(spec, violations);
     super::reschedule::rules(spec, violations);

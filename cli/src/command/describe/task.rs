@@ -3,8 +3,8 @@
 use jiff::Timestamp;
 use muster_api::kind::task::depend::DependsOn;
 use muster_api::kind::task::{
-    ContainerRun, EnvFrom, EnvVar, Files, OutOfRange, Placement, ProcessRun, Reschedule, Resources,
-    Task, TaskSpec, TaskStatus,
+    ContainerRun, EnvFrom, EnvVar, Files, OutOfRange, Placement, ProcessNetwork, ProcessRun,
+    Reschedule, Resources, RosSpec, Task, TaskSpec, TaskStatus,
 };
 
 use super::{begin, position, scored_by, when, which_node};
@@ -44,6 +44,7 @@ fn state(sheet: &mut Sheet, task: &Task, status: &TaskStatus, now: Timestamp) {
     sheet.maybe("To end", status.stop.as_ref().map(|s| format!("{}: {}", s.reason, s.message)));
     let seconds = |seconds: u32| format!("{seconds} s");
     sheet.maybe("Deadline", task.spec.active_deadline_seconds.map(seconds));
+    sheet.maybe("ROS", task.spec.ros.as_ref().map(ros));
     let standby = task.spec.standby.map(|standby| standby.after);
     let standby = standby.map(|after| format!("until its node had no contact for {after}"));
     sheet.maybe("Stands by", standby);
@@ -79,6 +80,13 @@ fn dependency(on: &DependsOn) -> String {
 }
 
 /// Of a running task: whether it serves.
+fn ros(ros: &RosSpec) -> String {
+    let namespace = ros.namespace.as_ref().map(|namespace| format!(", in {namespace}"));
+    let own = if ros.is_view() { "a master of its own" } else { "the node's master" };
+    let master = ros.uri().unwrap_or(own);
+    format!("{master}{}", namespace.unwrap_or_default())
+}
+
 fn ready(status: &TaskStatus) -> Option<Cell> {
     let word = columns::ready(status)?;
     Some(Cell::new(word, if status.is_ready() { Mood::Good } else { Mood::Warn }))
@@ -177,6 +185,8 @@ fn of_process(sheet: &mut Sheet, process: &ProcessRun) {
     let line: Vec<String> = process.command.iter().chain(&process.args).cloned().collect();
     sheet.field("Process", command_line(&line));
     sheet.maybe("User", process.user.clone());
+    let alone = process.network == ProcessNetwork::None;
+    sheet.maybe("Network", alone.then(|| "None".to_owned()));
     environment(sheet, &process.env, &process.env_from);
     files(sheet, &process.files);
     sheet.maybe("Directory", process.working_dir.clone());

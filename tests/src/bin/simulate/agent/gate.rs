@@ -203,7 +203,7 @@ impl Hall {
             }),
             drivers: vec![proto::Driver {
                 actuators: vec!["base:Drive".to_owned()],
-                error: String::new(),
+                ..proto::Driver::default()
             }],
             ..proto::Status::default()
         }
