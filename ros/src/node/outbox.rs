@@ -221,6 +221,8 @@ mod tests {
         let (outbox, mut to) = outbox(1, true).await;
         outbox.push(Bytes::from("first"));
         let many = async {
+            // The first one has come: what follows takes the place of what waits.
+            to.readable().await.unwrap();
             for n in 0..100 {
                 outbox.push(Bytes::from(format!("{n}")));
                 tokio::time::sleep(LOOK).await;
