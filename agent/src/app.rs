@@ -17,6 +17,7 @@ use std::os::unix::fs::DirBuilderExt;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::sync::Arc;
+use std::time::{Duration, Instant};
 
 use muster_api::id::TaskUid;
 use rustix::fs::FlockOperation;
@@ -424,13 +425,25 @@ fn make_data_dir(dir: &Path) -> Result<(), FileError> {
         .map_err(FileError::at("make", dir))
 }
 
+/// An agent that was killed while it started a program is not gone before that program is executed: until then it has the
+/// agent's files.
+const LOCK_WITHIN: Duration = Duration::from_secs(2);
+/// Between two tries.
+const LOCK_AGAIN: Duration = Duration::from_millis(20);
+
 fn lock(dir: &Path) -> Result<File, AgentError> {
     let path = dir.join("lock");
     let file = File::create(&path).map_err(FileError::at("open", &path))?;
-    match rustix::fs::flock(file.as_fd(), FlockOperation::NonBlockingLockExclusive) {
-        Ok(()) => Ok(file),
-        Err(rustix::io::Errno::WOULDBLOCK) => Err(AgentError::InUse(dir.to_owned())),
-        Err(errno) => Err(FileError::at("lock", &path)(errno.into()).into()),
+    let tries_until = Instant::now() + LOCK_WITHIN;
+    loop {
+        match rustix::fs::flock(file.as_fd(), FlockOperation::NonBlockingLockExclusive) {
+            Ok(()) => return Ok(file),
+            Err(rustix::io::Errno::WOULDBLOCK) if Instant::now() < tries_until => {
+                std::thread::sleep(LOCK_AGAIN);
+            }
+            Err(rustix::io::Errno::WOULDBLOCK) => return Err(AgentError::InUse(dir.to_owned())),
+            Err(errno) => return Err(FileError::at("lock", &path)(errno.into()).into()),
+        }
     }
 }
 
