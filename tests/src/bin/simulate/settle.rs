@@ -14,7 +14,7 @@ use crate::dice;
 use crate::framework::Deed;
 use crate::invariant::Invariant;
 use crate::truth::Cause;
-use crate::view::phase;
+use crate::view::{FENCED, phase};
 use crate::world::World;
 
 /// Longer than the longest back-off of a task, and than whatever waits for a time.
@@ -190,7 +190,7 @@ impl World {
             };
             // The end of a task on a fenced node is what the person said.
             if !status.phase.is_terminal()
-                || status.reason == "NodeFenced"
+                || status.reason == FENCED
                 || over.attempt != status.attempt
             {
                 continue;

@@ -59,6 +59,8 @@ pub(crate) struct Users {
     pub(crate) applications: Applications,
     /// Tasks that may end by order: somebody asked for it, or fenced their node.
     pub(crate) may_end: BTreeSet<TaskUid>,
+    /// Nodes of which somebody ever said that they are off.
+    pub(crate) fenced: BTreeSet<String>,
     pub(crate) writes: u64,
     pub(crate) refused: u64,
     pub(crate) unanswered: u64,
@@ -110,6 +112,7 @@ impl Users {
     /// `tasks`: those that are there.
     pub(crate) fn fence(&mut self, node: &str, tasks: Vec<TaskUid>) -> (u64, Request<Body>) {
         let path = format!("{NODES}/{node}/fence");
+        self.fenced.insert(node.to_owned());
         self.ask(Asked::Fence(tasks), "POST", path, &json!({"reason": "it is off"}))
     }
 

@@ -68,6 +68,9 @@ fn parse<T: DeserializeOwned>(stored: &Arc<Stored>) -> Result<T, Violation> {
     })
 }
 
+/// Why a task ended that was on a node which a person said is off.
+pub(crate) const FENCED: &str = "NodeFenced";
+
 /// The store's tasks, nodes, leases and frameworks.
 #[derive(Debug)]
 pub(crate) struct View {
@@ -84,6 +87,8 @@ pub(crate) struct View {
     epochs: BTreeMap<Key, u64>,
     /// By node the newest grant to a person: what was granted before never counts again.
     pub(crate) fences: BTreeMap<String, u64>,
+    /// Tasks that have ended with their nodes since somebody looked, and the nodes.
+    pub(crate) called_off: Vec<(TaskUid, String)>,
     /// What changed at the last look, for the log.
     pub(crate) news: Vec<String>,
     /// Since when a task waits without a reason, milliseconds.
@@ -103,6 +108,7 @@ impl Default for View {
             owners: BTreeMap::new(),
             epochs: BTreeMap::new(),
             fences: BTreeMap::new(),
+            called_off: Vec::new(),
             news: Vec::new(),
             mute: BTreeMap::new(),
         }
@@ -156,6 +162,10 @@ impl View {
             if was != is {
                 let on = after.status.as_ref().and_then(|s| s.node.as_deref()).unwrap_or_default();
                 self.news.push(format!("{}: {was}, now {is} {on}", key.name));
+                if after.status.as_ref().is_some_and(|s| s.reason == FENCED) {
+                    let uid = TaskUid::new(after.metadata.uid.as_deref().unwrap_or_default());
+                    self.called_off.push((uid, on.to_owned()));
+                }
             }
             let grant = |task: &Task| Some(task.status.as_ref()?.lease.as_ref()?.epoch);
             let (had, has) = (before.as_ref().and_then(grant), grant(after));

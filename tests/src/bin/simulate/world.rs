@@ -386,6 +386,7 @@ impl World {
             self.log.say(self.now, format_args!("{news}"));
         }
         followed?;
+        self.fences_count()?;
         self.may_lose();
         self.ends_were_acknowledged()?;
         if self.view.revision != before {
@@ -400,6 +401,19 @@ impl World {
         self.nobody_drives_beside()?;
         self.nobody_was_ended_for_nothing()?;
         self.whoever_waits_says_why()
+    }
+
+    /// What a person called off with its node may end, and what it does is theirs, also what was bound there after they asked.
+    fn fences_count(&mut self) -> Result<(), Violation> {
+        for (uid, node) in std::mem::take(&mut self.view.called_off) {
+            if !self.users.fenced.contains(&node) {
+                let how = format!("{uid} was called off with {node}, and nobody did that");
+                return Err(Invariant::WorkOutlivesItsManagers.broken(how));
+            }
+            self.truth.write_off(std::slice::from_ref(&uid));
+            self.users.may_end.insert(uid);
+        }
+        Ok(())
     }
 
     /// The tasks of frameworks that are over, or away for too long, may end.
