@@ -9,6 +9,12 @@ use std::collections::BTreeMap;
 )]
 pub struct NameError(pub String);
 
+/// A text as part of a name: what names do not have, as the dashes and dots of other names, is `_`.
+#[must_use]
+pub fn plain(text: &str) -> String {
+    text.chars().map(|c| if c.is_ascii_alphanumeric() { c } else { '_' }).collect()
+}
+
 /// A name may not be longer than anything that people write.
 const LONGEST: usize = 512;
 

@@ -4,6 +4,8 @@ use std::net::TcpListener;
 use std::path::Path;
 use std::process::Stdio;
 
+use muster_ros1::node::MasterState;
+use muster_ros1::{Node, NodeOptions};
 use tempfile::TempDir;
 use tokio::io::{AsyncBufReadExt as _, BufReader, Lines};
 use tokio::process::{Child, ChildStdout, Command};
@@ -16,6 +18,17 @@ use crate::wait::{self, DEADLINE};
 pub struct Ros {
     dir: TempDir,
     port: u16,
+}
+
+/// Waits until a node of ours has registered.
+///
+/// # Panics
+///
+/// When it takes too long.
+pub async fn registered(node: &Node) {
+    let mut state = node.state();
+    let known = state.wait_for(|state| *state == MasterState::Registered);
+    drop(tokio::time::timeout(DEADLINE, known).await.expect("in time").expect("the node is there"));
 }
 
 /// A program of ROS's, its output line by line.
@@ -98,6 +111,21 @@ impl Ros {
     #[must_use]
     pub fn master(&self) -> String {
         format!("http://127.0.0.1:{}", self.port)
+    }
+
+    /// A node of ours in this graph, which may not have registered yet.
+    ///
+    /// # Panics
+    ///
+    /// When it cannot start.
+    pub async fn node(&self, name: &str) -> Node {
+        let options = NodeOptions {
+            name: name.to_owned(),
+            master: Some(self.master()),
+            host: Some("127.0.0.1".to_owned()),
+            ..NodeOptions::default()
+        };
+        Node::start(options).await.expect("a node starts without a master")
     }
 
     /// Where it writes.

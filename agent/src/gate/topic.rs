@@ -5,6 +5,7 @@ use std::io;
 use std::time::Duration;
 
 use bytes::Bytes;
+use muster_ros1::name::plain;
 use muster_ros1::node::{MasterState, PublishOptions, Publisher};
 use muster_ros1::xmlrpc::http::Uri;
 use muster_ros1::{Node, NodeOptions, peer};
@@ -236,9 +237,7 @@ impl End {
 
 impl Ros {
     fn node(&self, topic: &str) -> NodeOptions {
-        let plain = |c: char| if c.is_ascii_alphanumeric() { c } else { '_' };
-        let topic: String = topic.trim_matches('/').chars().map(plain).collect();
-        let robot: String = self.robot.chars().map(plain).collect();
+        let (robot, topic) = (plain(&self.robot), plain(topic.trim_matches('/')));
         NodeOptions {
             name: format!("muster_gate_{robot}_{topic}"),
             master: Some(self.master.clone()),

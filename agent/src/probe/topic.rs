@@ -16,7 +16,7 @@ use muster_agent_core::probe::topic::{Seen, Wanted, judge};
 use muster_agent_core::probe::{Answer, Role};
 use muster_api::kind::task::probe::TopicCheck;
 use muster_ros1::env::Environment;
-use muster_ros1::name::Resolver;
+use muster_ros1::name::{Resolver, plain};
 use muster_ros1::node::{Arrivals, MasterState};
 use muster_ros1::{Node, NodeOptions};
 use tokio::sync::Mutex;
@@ -81,8 +81,7 @@ impl Target {
 
 impl Topics {
     pub(crate) fn new(ros: Ros, node: &str) -> Topics {
-        let plain = node.chars().map(|c| if c.is_ascii_alphanumeric() { c } else { '_' });
-        let name = format!("muster_probes_{}", plain.collect::<String>());
+        let name = format!("muster_probes_{}", plain(node));
         Topics { ros, name, nodes: Mutex::default() }
     }
 

@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use bytes::Bytes;
 use muster_ros1::message::{Type, describe};
-use muster_ros1::name::Resolver;
+use muster_ros1::name::{Resolver, plain};
 use muster_ros1::proto::sensor_msgs as proto;
 use muster_ros1::sensor_msgs::{Image, LaserScan};
 use prost::Message as _;
@@ -44,9 +44,10 @@ impl Topic {
                 Resolver::new(namespace, "agent", []).and_then(|names| names.resolve(topic)).ok()?
             }
             (None, Some(_)) => {
-                let plain = |c: char| if c.is_ascii_alphanumeric() || c == '/' { c } else { '_' };
-                let path: String = channel.function().path().chars().map(plain).collect();
-                Resolver::new("/", "agent", []).and_then(|names| names.resolve(&path)).ok()?
+                let path = channel.function().path();
+                let path: Vec<String> = path.split('/').map(plain).collect();
+                let names = Resolver::new("/", "agent", []);
+                names.and_then(|names| names.resolve(&path.join("/"))).ok()?
             }
             (None, None) => return None,
         };

@@ -23,7 +23,7 @@ use super::RETRY;
 use crate::context::Context;
 use crate::objects::{self, APPLICATIONS, NODES};
 use crate::session::Sessions;
-use crate::store::StoreError;
+use crate::store::{Op, StoreError};
 
 /// What agents get to reconnect after the controller started, on top of the usual detection time.
 /// A restart takes at most this long and must disturb nobody.
@@ -103,18 +103,23 @@ impl Marked {
 /// # Errors
 /// When the store fails.
 pub async fn doubt(context: &Context) -> Result<(), StoreError> {
-    for home in homes_of_what_is_away(context) {
-        let key = objects::node_key(&home);
-        objects::change(&context.store, &key, |stored, mut node: Node| {
-            let now = context.clock.now();
+    let now = MicroTime(context.clock.now());
+    let homes = homes_of_what_is_away(context).into_iter();
+    let homes = homes.filter_map(|home| context.store.get(&objects::node_key(&home)));
+    let doubts: Vec<Op> = homes
+        .filter_map(|stored| {
+            let mut node: Node = objects::read(&stored)?;
             let status = node.status.as_mut().filter(|status| was_heard(status))?;
             if status.unheard_since.is_some() {
                 return None;
             }
-            status.unheard_since = Some(MicroTime(now));
-            Some(vec![objects::replace(stored, &node)])
+            status.unheard_since = Some(now.clone());
+            Some(objects::replace(&stored, &node))
         })
-        .await?;
+        .collect();
+    if !doubts.is_empty() {
+        // Nobody else writes yet.
+        context.store.apply(doubts).await?;
     }
     Ok(())
 }

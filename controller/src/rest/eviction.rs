@@ -10,7 +10,7 @@ use super::path::Object;
 use super::{Answer, Call, body, delete, failure::Failure};
 use crate::context::Context;
 use crate::objects;
-use crate::store::{Op, Precondition, Stored};
+use crate::store::{Op, Stored};
 
 pub(super) async fn evict(call: Call, target: Object) -> Answer {
     let key = target.key()?;
@@ -49,7 +49,7 @@ fn no_mission(context: &Context, target: &Object, task: &Stored) -> Result<Optio
     }
     let key = objects::node_key(node);
     let Some(stored) = context.store.get(&key) else {
-        return Ok(Some(Op::Check { key, precondition: Precondition::Absent }));
+        return Ok(Some(objects::absent(&key)));
     };
     let lock = objects::read::<Node>(&stored).and_then(|node| node.mission_lock());
     if let Some(lock) = lock {
@@ -60,5 +60,5 @@ fn no_mission(context: &Context, target: &Object, task: &Stored) -> Result<Optio
         let failure = Failure::new(StatusCode::TOO_MANY_REQUESTS, "TooManyRequests", message);
         return Err(failure.about(target.entry, name).retry_after(10));
     }
-    Ok(Some(Op::Check { key, precondition: Precondition::revision(stored.revision) }))
+    Ok(Some(objects::unchanged(&stored)))
 }

@@ -13,6 +13,7 @@ use super::failure::Failure;
 use super::registry::{self, Entry, View};
 use super::{delete, metadata};
 use crate::context::Context;
+use crate::objects;
 use crate::store::{Key, Op, Precondition, Resource, StoreError, WatchEnd};
 
 const NAMESPACES: Resource = Resource::new("namespaces");
@@ -89,7 +90,7 @@ pub(super) fn admit_into(
             "metadata.namespace",
         ));
     }
-    Ok(Some(Op::Check { key, precondition: Precondition::revision(present.revision) }))
+    Ok(Some(objects::unchanged(&present)))
 }
 
 /// Empties and removes namespaces that end. Level-triggered: each round looks at all of them; what wakes it is only a

@@ -8,9 +8,9 @@ use std::time::{Duration, Instant};
 use futures::{AsyncBufReadExt as _, StreamExt as _};
 use http::Request;
 use kube::Client;
+use muster_ros1::Node;
 use muster_ros1::nav_msgs::Odometry;
 use muster_ros1::node::SubscribeOptions;
-use muster_ros1::{Node, NodeOptions};
 use muster_tests::{AgentOptions, Cluster, Ros};
 use serde_json::Value;
 
@@ -27,13 +27,7 @@ pub(crate) async fn pose() {
     cluster.join(options.flag("--ros-master", &ros.master()).flag("--ros-host", "127.0.0.1")).await;
     let mut driver = ros.script("odometry.py", &["odometry", "/odom", "30"]);
     driver.line_with("drives").await;
-    let options = NodeOptions {
-        name: "floor".to_owned(),
-        master: Some(ros.master()),
-        host: Some("127.0.0.1".to_owned()),
-        ..NodeOptions::default()
-    };
-    let node = Node::start(options).await.expect("a node");
+    let node = ros.node("floor").await;
     let until = Instant::now() + SPAN;
     let (floor, ours) = tokio::join!(subscribe(&node, until), watch(cluster.client().await, until));
     floor.line("floor: rospy to a bare subscriber");

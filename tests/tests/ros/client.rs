@@ -3,31 +3,16 @@
 use std::time::Duration;
 
 use bytes::Bytes;
+use muster_ros1::ALL;
 use muster_ros1::geometry_msgs::{Point, PointStamped, Twist, Vector3};
 use muster_ros1::nav_msgs::Odometry;
 use muster_ros1::node::{MasterState, PublishOptions, SubscribeOptions};
 use muster_ros1::sensor_msgs::Image;
 use muster_ros1::std_msgs::{self, Header};
 use muster_ros1::xmlrpc::Value;
-use muster_ros1::{ALL, Node, NodeOptions};
 use muster_tests::Ros;
+use muster_tests::ros::registered;
 use muster_tests::wait::{self, DEADLINE};
-
-async fn node(ros: &Ros, name: &str) -> Node {
-    let options = NodeOptions {
-        name: name.to_owned(),
-        master: Some(ros.master()),
-        host: Some("127.0.0.1".to_owned()),
-        ..NodeOptions::default()
-    };
-    Node::start(options).await.expect("a node starts without a master")
-}
-
-async fn registered(node: &Node) {
-    let mut state = node.state();
-    let known = state.wait_for(|state| *state == MasterState::Registered);
-    drop(tokio::time::timeout(DEADLINE, known).await.expect("in time").expect("the node is there"));
-}
 
 /// An image as `image.py` makes it.
 fn image() -> Image {
@@ -67,7 +52,7 @@ async fn checksums_are_those_of_rosmsg() {
 #[tokio::test(flavor = "multi_thread")]
 async fn rostopic_and_this_client_read_each_other() {
     let ros = Ros::start().await;
-    let node = node(&ros, "talker").await;
+    let node = ros.node("talker").await;
     let publisher = node
         .advertise::<PointStamped>(
             "/clicked",
@@ -117,7 +102,7 @@ async fn rostopic_and_this_client_read_each_other() {
 #[tokio::test(flavor = "multi_thread")]
 async fn large_images_pass_both_ways() {
     let ros = Ros::start().await;
-    let node = node(&ros, "eye").await;
+    let node = ros.node("eye").await;
     let mut publisher = ros.script("image.py", &["publish"]);
     let checksum = publisher.line().await;
     let mut images = node.subscribe::<Image>("/image", SubscribeOptions::default()).unwrap();
@@ -146,7 +131,7 @@ async fn large_images_pass_both_ways() {
 #[tokio::test(flavor = "multi_thread")]
 async fn a_type_that_does_not_fit_is_told_and_not_read() {
     let ros = Ros::start().await;
-    let node = node(&ros, "reader").await;
+    let node = ros.node("reader").await;
     let _pub = ros.spawn("rostopic", &["pub", "-r", "20", "/odom", "std_msgs/String", "data: x"]);
     let wrong = node.subscribe::<Odometry>("/odom", SubscribeOptions::default()).unwrap();
     wait::until("refused for its type", || async {
@@ -165,7 +150,7 @@ async fn a_type_that_does_not_fit_is_told_and_not_read() {
 #[tokio::test(flavor = "multi_thread")]
 async fn restarts_of_master_and_publisher_are_survived() {
     let ros = Ros::start().await;
-    let node = node(&ros, "survivor").await;
+    let node = ros.node("survivor").await;
     let mut strings =
         node.subscribe::<std_msgs::String>("/chatter", SubscribeOptions::default()).unwrap();
     let publisher = node.advertise::<std_msgs::Int32>("/count", PublishOptions::default()).unwrap();
@@ -213,7 +198,7 @@ async fn restarts_of_master_and_publisher_are_survived() {
     while listed().await {
         tries += 1;
         assert!(tries < 4, "it stays listed");
-        let again = self::node(&ros, "survivor").await;
+        let again = ros.node("survivor").await;
         let options = SubscribeOptions::default();
         let _strings = again.subscribe::<std_msgs::String>("/chatter", options).unwrap();
         registered(&again).await;
@@ -224,7 +209,7 @@ async fn restarts_of_master_and_publisher_are_survived() {
 #[tokio::test(flavor = "multi_thread")]
 async fn parameters_are_read_and_followed() {
     let ros = Ros::start().await;
-    let node = node(&ros, "settings").await;
+    let node = ros.node("settings").await;
     let master = node.master();
     assert!(!master.has_param("/speed").await.unwrap());
     assert!(master.param("/speed").await.unwrap_err().is_refusal());

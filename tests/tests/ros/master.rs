@@ -1,10 +1,10 @@
 //! Our master in roscore's place: rospy, roscpp's rosout, roslaunch and the tools find each other by it.
 
-use muster_ros1::node::MasterState;
+use muster_ros1::Node;
 use muster_ros1::roscore::Roscore;
 use muster_ros1::xmlrpc::Value;
-use muster_ros1::{Node, NodeOptions};
 use muster_tests::Ros;
+use muster_tests::ros::registered;
 use muster_tests::wait::{self, DEADLINE};
 use tokio::net::TcpListener;
 
@@ -15,16 +15,8 @@ async fn master() -> (Ros, Roscore) {
 }
 
 async fn node(ros: &Ros, name: &str) -> Node {
-    let options = NodeOptions {
-        name: name.to_owned(),
-        master: Some(ros.master()),
-        host: Some("127.0.0.1".to_owned()),
-        ..NodeOptions::default()
-    };
-    let node = Node::start(options).await.expect("a node");
-    let mut state = node.state();
-    let known = state.wait_for(|state| *state == MasterState::Registered);
-    drop(tokio::time::timeout(DEADLINE, known).await.expect("in time").expect("it is there"));
+    let node = ros.node(name).await;
+    registered(&node).await;
     node
 }
 

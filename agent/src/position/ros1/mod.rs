@@ -15,6 +15,7 @@ use std::time::Duration;
 
 use muster_agent_core::pose::judge::{self, Source};
 use muster_agent_core::pose::tracker::Tracker;
+use muster_ros1::name::plain;
 use muster_ros1::node::{Incoming, MasterState, SubscribeOptions, Subscriber};
 use muster_ros1::{Node, NodeOptions};
 use tokio::sync::watch;
@@ -58,8 +59,7 @@ pub(super) fn open(topic: &str, map: &str, name: &str, settings: &PoseSettings) 
 
 /// The same after each start, so that the master forgets the one before. Names of nodes have dashes and dots, ROS's not.
 fn node_name(node: &str) -> String {
-    let plain = node.chars().map(|c| if c.is_ascii_alphanumeric() { c } else { '_' });
-    format!("muster_agent_{}", plain.collect::<String>())
+    format!("muster_agent_{}", plain(node))
 }
 
 impl Reader {

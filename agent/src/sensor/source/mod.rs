@@ -10,6 +10,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use muster_ros1::NodeOptions;
+use muster_ros1::name::plain;
 use tokio::time::Instant;
 use tokio_util::sync::CancellationToken;
 
@@ -51,10 +52,6 @@ impl Context {
             ..NodeOptions::default()
         }
     }
-}
-
-fn plain(name: &str) -> String {
-    name.chars().map(|c| if c.is_ascii_alphanumeric() { c } else { '_' }).collect()
 }
 
 /// Reads it until it ends, or `end`: why.

@@ -22,7 +22,7 @@ use crate::reconcile::owned::Owner;
 use crate::rest::create::namespace_guard;
 use crate::rest::delete;
 use crate::rest::failure::Failure;
-use crate::store::{Key, Op, Precondition, StoreError, Stored};
+use crate::store::{Key, Op, StoreError, Stored};
 
 /// What became of a plan.
 pub(super) enum Outcome {
@@ -73,10 +73,7 @@ pub(super) async fn carry_out(
     // Everything holds only while the set is what the plan was made for.
     let mut ops = vec![match same {
         false => Op::status(stored, &status),
-        true => Op::Check {
-            key: stored.key.clone(),
-            precondition: Precondition::revision(stored.revision),
-        },
+        true => objects::unchanged(stored),
     }];
     ops.extend(more);
     match context.store.apply(ops).await {
@@ -319,8 +316,7 @@ impl Work<'_> {
             {
                 return Err(Stop::Away);
             }
-            let precondition = Precondition::revision(node.revision);
-            ops.push(Op::Check { key: node.key.clone(), precondition });
+            ops.push(objects::unchanged(&node));
         }
         Ok(ops)
     }

@@ -23,7 +23,7 @@
 
 use std::time::Duration;
 
-use muster_api::kind::application::{CutOff, stamp};
+use muster_api::kind::application::{CutOff, Part, stamp};
 use muster_api::phase::TaskPhase;
 
 use super::runner::Runner;
@@ -56,20 +56,25 @@ impl Alone {
     pub(super) fn of(patience: Option<Duration>, grace: Duration, when: CutOff) -> Self {
         let takes = grace + SLACK;
         let fenced = patience.unwrap_or_default().max(BEARS * 2 + takes);
-        let begin = match (when, patience) {
-            (CutOff::InTime, Some(patience)) => patience.max(BEARS),
-            (CutOff::Fenced, _) | (_, None) => fenced,
-        };
+        let begin = urgent(when, patience).map_or(fenced, |patience| patience.max(BEARS));
         Alone { stop: fenced.saturating_sub(takes) / 2, begin }
     }
+}
+
+/// How long its connections bear, of a part that is begun in time; none: it waits until what is away has surely ended.
+fn urgent(when: CutOff, patience: Option<Duration>) -> Option<Duration> {
+    patience.filter(|_| when == CutOff::InTime)
+}
+
+fn grace(part: &Part) -> Duration {
+    Duration::from_secs(part.template.spec.grace_period_seconds.into())
 }
 
 impl Runner {
     pub(super) fn alone_after(&self, look: &Look<'_>) -> Option<Alone> {
         let part = self.spec(look)?;
         let patience = look.model.patience(self.part?);
-        let grace = Duration::from_secs(part.template.spec.grace_period_seconds.into());
-        Some(Alone::of(patience, grace, part.when_cut_off))
+        Some(Alone::of(patience, grace(part), part.when_cut_off))
     }
 
     /// What became of the task that stands by.
@@ -131,17 +136,15 @@ impl Runner {
     }
 
     /// After how long without contact the robot may begin what stands by for a task that is away; none: that does not end
-    /// by itself, which it must at some time in any case.
+    /// by itself.
     fn begins_after(&self, look: &Look<'_>, away: Attempt) -> Option<Duration> {
         let part = self.spec(look)?;
         let stop = self.task(look, away)?.view.stop_after?;
         let begin = self.alone_after(look)?.begin;
-        let watched = look.model.patience(self.part?).is_some();
-        if part.when_cut_off == CutOff::InTime && watched {
-            return Some(begin);
-        }
-        let grace = Duration::from_secs(part.template.spec.grace_period_seconds.into());
-        Some(begin.max(stop * 2 + grace + SLACK))
+        Some(match urgent(part.when_cut_off, look.model.patience(self.part?)) {
+            Some(_) => begin,
+            None => begin.max(stop * 2 + grace(part) + SLACK),
+        })
     }
 
     /// Ends what is away of a robot that cannot be reached and has something that stands by.
