@@ -36,7 +36,7 @@ const CALL: &[Step] = &[Step::Before, Step::After];
 /// A key and its certificate.
 const PAIR: &[Step] =
     &[Step::Before, Step::Created, Step::Written, Step::Removed, Step::Half, Step::After];
-/// A removal in two parts.
+/// Something in two parts.
 const PARTS: &[Step] = &[Step::Before, Step::Half, Step::After];
 
 macro_rules! failpoints {
@@ -69,6 +69,8 @@ macro_rules! failpoints {
 }
 
 failpoints! {
+    /// Controller: the store's tables.
+    StoreSchema = "store-schema" CALL,
     /// Controller: a batch of objects, and who wrote them is not answered.
     StoreCommit = "store-commit" CALL,
     /// Controller: history is forgotten.
@@ -87,6 +89,8 @@ failpoints! {
     Kubeconfig = "kubeconfig" FILE,
     /// Controller: a line of the audit log.
     AuditLine = "audit-line" CALL,
+    /// Controller: the audit log's files get the next numbers. Half: all but the present one have theirs.
+    AuditRotation = "audit-rotation" PARTS,
 
     /// Agent: whose data directory it is.
     AgentIdentity = "agent-identity" FILE,

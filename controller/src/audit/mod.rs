@@ -315,6 +315,24 @@ mod tests {
     }
 
     #[tokio::test]
+    async fn files_move_as_far_as_a_number_is_free() {
+        let dir = tempfile::tempdir().unwrap();
+        let place = dir.path().join("audit");
+        let audit = short(&place);
+        for number in 0..DONE.files {
+            audit.write(line(&number.to_string())).await.unwrap();
+        }
+        // A crash has left it so.
+        std::fs::remove_file(place.join("audit.jsonl.3")).unwrap();
+        audit.write(line("next")).await.unwrap();
+        let name =
+            |number: u32| lines(&place.join(format!("{}.{number}", DONE.name)))[0]["name"].clone();
+        let kept: Vec<Value> = (1..DONE.files).map(name).collect();
+        assert_eq!(kept, ["7", "6", "5", "3", "2", "1", "0"]);
+        assert_eq!(lines(&place.join(DONE.name))[0]["name"], "next");
+    }
+
+    #[tokio::test]
     async fn what_was_refused_pushes_out_nothing_that_was_done() {
         let dir = tempfile::tempdir().unwrap();
         let place = dir.path().join("audit");

@@ -188,22 +188,34 @@ impl Log {
         written
     }
 
-    /// Gives every file the next number; the last one goes.
+    /// Gives every file the next number; the last one goes. Where a number is free, as after a crash in the middle of this, no
+    /// file behind it is moved.
     fn rotate(&self) -> io::Result<()> {
-        for number in (0..self.bound.files - 1).rev() {
-            let (from, to) = (self.numbered(number), self.numbered(number + 1));
-            match std::fs::rename(self.dir.join(from), self.dir.join(to)) {
+        reach(Failpoint::AuditRotation, Step::Before);
+        let last = self.bound.files - 1;
+        let mut free = 1;
+        while free < last && self.numbered(free).try_exists()? {
+            free += 1;
+        }
+        for number in (0..free).rev() {
+            if number == 0 {
+                reach(Failpoint::AuditRotation, Step::Half);
+            }
+            match std::fs::rename(self.numbered(number), self.numbered(number + 1)) {
+                // Somebody has taken it away.
                 Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(error),
                 _ => {}
             }
         }
+        reach(Failpoint::AuditRotation, Step::After);
         Ok(())
     }
 
-    fn numbered(&self, number: u32) -> String {
+    fn numbered(&self, number: u32) -> PathBuf {
+        let name = self.bound.name;
         match number {
-            0 => self.bound.name.to_owned(),
-            _ => format!("{}.{number}", self.bound.name),
+            0 => self.dir.join(name),
+            _ => self.dir.join(format!("{name}.{number}")),
         }
     }
 }

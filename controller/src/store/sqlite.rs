@@ -109,7 +109,10 @@ async fn migrate(connection: &mut SqliteConnection, path: &Path) -> Result<(), O
     });
     let supported = SCHEMA.iter().map(|(version, ..)| *version).max().unwrap_or_default();
     let migrator = Migrator::with_migrations(migrations.collect());
-    match migrator.run_direct(None, connection, false).await {
+    reach(Failpoint::StoreSchema, Step::Before);
+    let migrated = migrator.run_direct(None, connection, false).await;
+    reach(Failpoint::StoreSchema, Step::After);
+    match migrated {
         Ok(()) => Ok(()),
         Err(MigrateError::VersionMissing(found)) if found > supported => {
             Err(OpenError::Newer { path: PathBuf::from(path), found, supported })

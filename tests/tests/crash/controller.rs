@@ -1,6 +1,8 @@
 //! The controller: its first start, what it stores, and what it writes down of who stored it.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::fs::OpenOptions;
+use std::io::Write as _;
 use std::path::Path;
 use std::process::{Command, Output};
 
@@ -59,6 +61,17 @@ async fn die_at(cluster: &mut Cluster, point: Failpoint) {
 struct Told {
     /// Path of an object, and its uid.
     acknowledged: BTreeMap<String, String>,
+}
+
+impl Told {
+    /// Every creation has a line of its own.
+    fn stand_once_in<'a>(&self, lines: impl IntoIterator<Item = &'a Value>) {
+        let lines: Vec<&Value> = lines.into_iter().collect();
+        for (path, uid) in &self.acknowledged {
+            let of = |line: &&&Value| line["verb"] == "create" && line["uid"] == **uid;
+            assert_eq!(lines.iter().filter(of).count(), 1, "{path} {uid}");
+        }
+    }
 }
 
 /// Creates objects one after the other, and tries each again until it is known to be there.
@@ -146,14 +159,54 @@ pub(crate) async fn audit_lines(points: &[Failpoint]) {
         moments(points).into_iter().flat_map(|moment| [1, 3].map(|nth| (moment, nth))).collect();
     let told = written(&mut cluster, &crashes).await;
     assert!(told.acknowledged.len() >= crashes.len() * 10, "{told:?}");
-    let log = cluster.dir().join("controller/audit/audit.jsonl");
-    let log = std::fs::read_to_string(log).expect("it is written");
-    let lines: Vec<Value> =
-        log.lines().map(|line| serde_json::from_str(line).expect("a whole line")).collect();
-    for (path, uid) in &told.acknowledged {
-        let of = |line: &&Value| line["verb"] == "create" && line["uid"] == **uid;
-        assert_eq!(lines.iter().filter(of).count(), 1, "{path} {uid}");
+    told.stand_once_in(&lines(&cluster.dir().join("controller/audit/audit.jsonl")));
+}
+
+fn lines(log: &Path) -> Vec<Value> {
+    let text = std::fs::read_to_string(log).expect("it is written");
+    text.lines().map(|line| serde_json::from_str(line).expect("a whole line")).collect()
+}
+
+/// The present file is full at each of these. What stood in it stays, and is not pushed further than it must.
+pub(crate) async fn audit_rotation(points: &[Failpoint]) {
+    const FULL: usize = 64 << 20;
+    let mut cluster = Cluster::start().await;
+    let (mut told, dir) = (Told::default(), cluster.dir().join("controller/audit"));
+    let moments = moments(points);
+    for (round, moment) in moments.iter().enumerate() {
+        let crash = Crash::at(&mut cluster, "controller", *moment, 1);
+        cluster.kill_controller();
+        std::fs::create_dir_all(&dir).expect("it is ours");
+        let mut log = OpenOptions::new()
+            .append(true)
+            .create(true)
+            .open(dir.join("audit.jsonl"))
+            .expect("it is there");
+        writeln!(log, "{}", json!({"round": round, "fills": "x".repeat(FULL)}))
+            .expect("there is room");
+        drop(log);
+        cluster.spawn_controller();
+        let (client, place) = (cluster.client().await, cluster.dir().to_owned());
+        let nurse = async {
+            crash.of_daemon(&mut cluster).await;
+            cluster.start_controller().await;
+        };
+        tokio::join!(write(&client, round, &place, &mut told), nurse);
     }
+    // The newest one first.
+    let mut names = vec!["audit.jsonl".to_owned()];
+    names.extend((1..=moments.len()).map(|number| format!("audit.jsonl.{number}")));
+    let lines = names.iter().map(|name| lines(&dir.join(name)));
+    let lines: Vec<Vec<Value>> = lines.collect();
+    for (round, lines) in lines[1..].iter().rev().enumerate() {
+        let rounds: Vec<&Value> = lines.iter().filter_map(|line| line.get("round")).collect();
+        assert_eq!(rounds, [round]);
+    }
+    assert_eq!(
+        files(&dir).iter().filter(|path| path.to_string_lossy().contains("audit.jsonl")).count(),
+        names.len()
+    );
+    told.stand_once_in(lines.iter().flatten());
 }
 
 /// A newer key in front of the one that a Secret was sealed with.

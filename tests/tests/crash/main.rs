@@ -32,9 +32,10 @@ macro_rules! tests {
 
 tests! {
     certificates_of_a_first_start: controller::first_start => CaPair, ServerPair, AdminPair;
-    keys_and_kubeconfig_of_a_first_start: controller::first_start => EncryptionKey, Kubeconfig;
+    keys_and_kubeconfig_of_a_first_start: controller::first_start => EncryptionKey, Kubeconfig, StoreSchema;
     commits: controller::commits => StoreCommit;
     audit_lines: controller::audit_lines => AuditLine;
+    full_audit_files: controller::audit_rotation => AuditRotation;
     older_keys: controller::reseal => StoreReseal;
     history: controller::compaction => StoreCompaction;
 
