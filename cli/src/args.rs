@@ -9,8 +9,8 @@ use muster_api::selector::{FieldSelector, LabelSelector, SelectorError};
 
 use crate::client::Selection;
 use crate::command::{
-    apply, cordon, create, delete, describe, drain, estop, exec, get, lease, local, logs, node,
-    offers, plan, rollout, scale, token, top, version, wait, why,
+    apply, cordon, create, delete, describe, drain, estop, exec, framework, get, lease, local,
+    logs, node, offers, plan, rollout, scale, token, top, version, wait, why,
 };
 use crate::output::ui::Color;
 
@@ -99,6 +99,9 @@ pub(crate) enum Command {
     /// Hold a robot's actuators yourself, instead of a task
     #[command(subcommand)]
     Lease(lease::Command),
+    /// Say where a running framework works
+    #[command(subcommand)]
+    Framework(framework::Command),
     /// Tokens with which agents join, and tokens of users
     #[command(subcommand)]
     Token(token::Command),
@@ -227,6 +230,9 @@ mod tests {
             "muster lease take r1 --reason stuck",
             "muster lease acquire r1/arm",
             "muster lease return r1",
+            "muster framework set-position deliver --at -3,4 --radius 20",
+            "muster framework set-position deliver --everywhere",
+            "muster framework set-position deliver --clicked --ros-master http://r1:11311 --topic /goal",
             "muster token list",
             "muster token create --user ada --group lab --ttl 8h --as-kubeconfig",
             "muster token list --users",

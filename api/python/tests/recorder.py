@@ -54,6 +54,9 @@ class Recorder(muster.Scheduler):
     def node_lost(self, driver, node, message):
         self.heard.tell("node_lost", node, message)
 
+    def moved(self, driver, position, by):
+        self.heard.tell("moved", position, by)
+
     def executor_lost(self, driver, executor, node, exit_code, message):
         self.heard.tell("executor_lost", executor, node, exit_code, message)
 

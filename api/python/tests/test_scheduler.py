@@ -342,6 +342,29 @@ def test_the_next_session_subscribes_with_the_position_that_was_set(controller, 
     assert subscribe.filter.selector == "", "what was refused would end the framework here"
 
 
+def test_where_somebody_else_sets_it_to_work_is_said_and_remembered(controller, start):
+    info = muster.FrameworkInfo(name="deliver", position=muster.Position(1, 1), radius=7)
+    driver, scheduler, session = registered(controller, start, info=info)
+    there = pb.Position(map="hall", x=5, y=6, radius=3, cost=pb.COST_TRAVEL_TIME)
+    session.send(moved=pb.Moved(position=there, by="ada"))
+    position = muster.Position(5, 6, map="hall", radius=3, cost=muster.Cost.TRAVEL_TIME)
+    assert scheduler.heard.expect("moved") == (position, "ada")
+    session.end()
+    again = controller.accept()
+    assert again.subscribed(reregistered=True).position == there
+    assert (scheduler.heard.expect("disconnected"), scheduler.heard.expect("reregistered")) == ((), ())
+    anywhere = pb.Position(map="map", x=8, y=9, cost=pb.COST_DISTANCE)
+    again.send(moved=pb.Moved(position=anywhere, by="ada"))
+    assert scheduler.heard.expect("moved") == (muster.Position(8, 9), "ada")
+    again.send(moved=pb.Moved(by="ada"))
+    assert scheduler.heard.expect("moved") == (None, "ada")
+    again.send(moved=pb.Moved(position=anywhere, by="ada"))
+    scheduler.heard.expect("moved")
+    again.end()
+    last = controller.accept()
+    assert last.subscribed(reregistered=True).position == anywhere, "at any distance"
+
+
 def test_a_silent_connection_is_given_up_after_five_heartbeats(controller, start):
     driver, scheduler = start()
     session = controller.accept()

@@ -42,6 +42,8 @@ pub enum Event {
     Message(proto::Message),
     /// A node does not answer.
     NodeLost(proto::NodeLost),
+    /// Somebody else has set where the framework works; offers from there follow.
+    Moved(proto::Moved),
     /// An executor ended.
     ExecutorLost(proto::ExecutorLost),
     /// The framework has ended; nothing comes after it.

@@ -54,7 +54,7 @@ pub use scheduler::{Scheduler, SchedulerDriver};
 /// Messages of the session that callbacks and events carry as they are; `framework.proto` documents their fields.
 pub mod wire {
     pub use muster_api::wire::framework::v1::{
-        Compute, Cost, Executor, ExecutorLost, Launched, Message, NodeKind, NodeLost, Offer, Pose,
-        RescindReason, TaskState, Update,
+        Compute, Cost, Executor, ExecutorLost, Launched, Message, Moved, NodeKind, NodeLost, Offer,
+        Pose, RescindReason, TaskState, Update,
     };
 }

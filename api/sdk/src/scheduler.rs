@@ -74,6 +74,15 @@ pub trait Scheduler: Send {
         async {}
     }
 
+    /// Somebody else has set where the framework works. Offers for the old position are rescinded.
+    fn moved(
+        &mut self,
+        _handle: &FrameworkHandle,
+        _moved: &proto::Moved,
+    ) -> impl Future<Output = ()> + Send {
+        async {}
+    }
+
     /// An executor ended.
     fn executor_lost(
         &mut self,
@@ -151,6 +160,7 @@ impl SchedulerDriver {
             }
             Event::Message(message) => scheduler.framework_message(handle, message).await,
             Event::NodeLost(lost) => scheduler.node_lost(handle, lost).await,
+            Event::Moved(moved) => scheduler.moved(handle, &moved).await,
             Event::ExecutorLost(lost) => scheduler.executor_lost(handle, lost).await,
             // Taken by the loop.
             Event::Error(_) => {}

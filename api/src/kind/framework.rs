@@ -62,6 +62,29 @@ pub struct FrameworkSpec {
     pub failover_timeout: FailoverTimeout,
 }
 
+/// Where a framework works, as somebody else may set it: the part of its spec that says so.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "camelCase", deny_unknown_fields, default)]
+pub struct FrameworkPosition {
+    /// The operation position; none: everywhere.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub position: Option<OperationPosition>,
+    /// How far from it a robot may be, metres; none: any distance.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub radius: Option<f64>,
+    /// How robots are scored.
+    pub cost: Cost,
+}
+
+impl FrameworkPosition {
+    /// The spec with this position in place of its own.
+    #[must_use]
+    pub fn of(&self, spec: &FrameworkSpec) -> FrameworkSpec {
+        let FrameworkPosition { position, radius, cost } = self.clone();
+        FrameworkSpec { position, radius, cost, ..spec.clone() }
+    }
+}
+
 /// How long a framework may be away; a type of its own for its default.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(transparent)]

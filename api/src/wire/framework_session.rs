@@ -64,6 +64,23 @@ pub fn set_position(
     Ok(())
 }
 
+/// The position of a spec; none: everywhere.
+#[must_use]
+pub fn position_to_wire(spec: &FrameworkSpec) -> Option<wire::Position> {
+    let cost = match spec.cost {
+        Cost::Distance => wire::Cost::Distance,
+        Cost::TravelTime => wire::Cost::TravelTime,
+    };
+    spec.position.as_ref().map(|p| wire::Position {
+        map: p.map.clone(),
+        x: p.x,
+        y: p.y,
+        z: p.z,
+        radius: spec.radius,
+        cost: cost.into(),
+    })
+}
+
 /// Puts a filter into a spec; none: everything.
 ///
 /// # Errors

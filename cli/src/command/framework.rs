@@ -3,13 +3,13 @@
 //! A position is one of the command line's, or each one that somebody clicks in rviz, which publishes it on `/clicked_point`
 //! (Avalon, IV-A3). What is not named stays as the framework has it: a click changes no radius.
 
-use muster_api::kind::framework::{Framework, FrameworkPosition};
+use muster_api::kind::framework::{Framework, FrameworkPosition, FrameworkSpec};
 use muster_api::kind::task::Cost;
 use muster_api::pose::{DEFAULT_MAP, OperationPosition};
 use muster_ros1::geometry_msgs::PointStamped;
 use muster_ros1::node::{MasterState, SubscribeOptions};
 use muster_ros1::{Node, NodeOptions};
-use serde_json::{Value, json};
+use serde_json::json;
 
 use super::Outcome;
 use crate::client::path;
@@ -116,15 +116,14 @@ async fn set(
 ) -> Outcome {
     let info = target::kind("framework")?;
     let namespace = Some(session.namespace.as_str());
-    let present = match place {
-        Some(_) => session.client.get(info, namespace, &args.name).await?,
-        None => Value::Null,
-    };
-    let present = serde_json::from_value::<Framework>(present).map(|known| known.spec);
     let spec = match place {
         None => FrameworkPosition::default(),
         Some((Point([x, y, z]), frame)) => {
-            let present = present.unwrap_or_default();
+            let present = session.client.get(info, namespace, &args.name).await?;
+            let present: Framework = serde_json::from_value(present).map_err(|error| {
+                CliError::usage(format!("framework/{} cannot be read: {error}", args.name))
+            })?;
+            let present = present.spec;
             let map = args.map.clone().or(frame);
             let map = map.or_else(|| present.position.map(|position| position.map));
             FrameworkPosition {
@@ -144,20 +143,16 @@ async fn set(
         }
     };
     let uri = format!("{}/position", path(info, namespace, Some(&args.name)));
-    let set: Value = session.client.post_json(&uri, &json!({ "spec": spec })).await?;
-    session.ui.line(&format!("framework/{} works {}", args.name, words(&set["spec"])))?;
+    let set: Framework = session.client.post_json(&uri, &json!({ "spec": spec })).await?;
+    session.ui.line(&format!("framework/{} works {}", args.name, words(&set.spec)))?;
     Ok(exit::OK)
 }
 
-/// Where somebody works, by a Framework's spec.
-fn words(spec: &Value) -> String {
-    let Ok(spec) = serde_json::from_value::<FrameworkPosition>(spec.clone()) else {
-        return "elsewhere".to_owned();
-    };
-    let Some(OperationPosition { map, x, y, z }) = spec.position else {
+fn words(spec: &FrameworkSpec) -> String {
+    let Some(OperationPosition { map, x, y, z }) = &spec.position else {
         return "everywhere".to_owned();
     };
-    let up = if z == 0.0 { String::new() } else { format!(", {z:.2}") };
+    let up = if *z == 0.0 { String::new() } else { format!(", {z:.2}") };
     let within = spec.radius.map(|radius| format!(", within {radius:.2} m"));
     format!("at ({x:.2}, {y:.2}{up}) of map {map:?}{}", within.unwrap_or_default())
 }
@@ -210,6 +205,8 @@ async fn follow(args: &Args, session: &mut Session) -> Outcome {
 
 #[cfg(test)]
 mod tests {
+    use serde_json::Value;
+
     use super::*;
     use crate::fake::Fake;
 

@@ -10,6 +10,7 @@ pub(crate) mod drain;
 pub(crate) mod estop;
 pub(crate) mod exec;
 pub(crate) mod fence;
+pub(crate) mod framework;
 pub(crate) mod get;
 pub(crate) mod gone;
 pub(crate) mod lease;
@@ -98,6 +99,7 @@ pub(crate) async fn dispatch(command: Command, session: &mut Session) -> Outcome
         Command::Estop(args) => estop::run(args, session).await,
         Command::Node(command) => node::run(command, session).await,
         Command::Lease(command) => lease::run(command, session).await,
+        Command::Framework(command) => framework::run(command, session).await,
         Command::Token(command) => token::run(command, session).await,
         Command::Local(_) | Command::Version(_) => {
             unreachable!("these are run before a kubeconfig is read")

@@ -265,6 +265,7 @@ fn resource(entry: &Entry) -> Vec<Shown> {
             sub("take", None, "LeaseRequest", &["create"]);
         }
         (GROUP, "Node") => sub("fence", None, "NodeFence", &["create"]),
+        (_, "Framework") => sub("position", None, "FrameworkPosition", &["create"]),
         (_, "TaskSet") => {
             sub("scale", Some(("autoscaling", "v1")), "Scale", &["get", "patch", "update"]);
         }

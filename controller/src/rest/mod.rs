@@ -63,6 +63,7 @@ mod owners;
 mod patch;
 pub mod path;
 mod poses;
+mod position;
 mod protobuf;
 pub(crate) mod query;
 mod question;
@@ -276,6 +277,9 @@ async fn objects(call: Call, verb: Verb, object: Object) -> Answer {
     }
     if let Some(Subresource::Lease(step)) = object.subresource {
         return lease::answer(call, object, step).await;
+    }
+    if object.subresource == Some(Subresource::Position) {
+        return position::set(call, object).await;
     }
     if object.subresource == Some(Subresource::Scale) {
         return scale::answer(call, verb, object).await;

@@ -58,6 +58,8 @@ pub enum Subresource {
     Exec,
     /// `…/attach`
     Attach,
+    /// `…/position`
+    Position,
     /// `…/acquire`, `…/take`, `…/return`
     Lease(Step),
 }
@@ -75,6 +77,7 @@ impl Subresource {
             Self::Eviction => "eviction",
             Self::Exec => "exec",
             Self::Attach => "attach",
+            Self::Position => "position",
             Self::Lease(Step::Acquire) => "acquire",
             Self::Lease(Step::Take) => "take",
             Self::Lease(Step::Return) => "return",
@@ -107,6 +110,7 @@ impl Object {
                 | Subresource::Eviction
                 | Subresource::Exec
                 | Subresource::Attach
+                | Subresource::Position
                 | Subresource::Lease(_),
             ) => verb == Verb::Create,
             Some(Subresource::Scale) => matches!(verb, Verb::Get | Verb::Update | Verb::Patch),
@@ -346,6 +350,7 @@ pub(super) fn subresource(entry: &Entry, name: &str) -> Option<Subresource> {
         "eviction" => (Subresource::Eviction, entry.info.kind == "Pod"),
         "exec" => (Subresource::Exec, entry.info.kind == "Pod"),
         "attach" => (Subresource::Attach, entry.info.kind == "Pod"),
+        "position" => (Subresource::Position, entry.info.kind == "Framework"),
         "scale" => (Subresource::Scale, entry.info.kind == "TaskSet"),
         "acquire" => (Subresource::Lease(Step::Acquire), is_lease),
         "take" => (Subresource::Lease(Step::Take), is_lease),

@@ -82,6 +82,48 @@ async fn until(body: &mut kube::client::Body, wanted: impl Fn(&Value) -> bool) -
     }
 }
 
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn somebody_else_says_where_a_framework_works() {
+    let cluster = Cluster::start().await;
+    let admin = cluster.admin().await;
+    let path = format!("{G}/namespaces/default/frameworks/deliver");
+    let at = |x: f64| json!({"spec": {"position": {"x": x, "y": 2.0}, "radius": 5.0}});
+    let set = async |body: Value| send(&admin, "POST", &format!("{path}/position"), body).await;
+    assert_eq!(refusal(&set(at(1.0)).await), (404, "NotFound"));
+    let (_, event, mut session) = subscribe(&admin, "default").await;
+    assert!(event["subscribed"].is_object(), "{event}");
+
+    let (code, framework) = set(at(1.0)).await;
+    assert_eq!((code, &framework["spec"]["position"]["x"]), (200, &1.0.into()), "{framework}");
+    let event = until(&mut session, |event| event["moved"].is_object()).await;
+    let position =
+        json!({"map": "map", "x": 1.0, "y": 2.0, "radius": 5.0, "cost": "COST_DISTANCE"});
+    assert_eq!(event["moved"]["position"], position);
+    assert!(!event["moved"]["by"].as_str().unwrap().is_empty());
+    let (code, framework) = set(json!({"spec": {}})).await;
+    assert_eq!((code, framework["spec"].get("position")), (200, None), "everywhere");
+    let event = until(&mut session, |event| event["moved"].is_object()).await;
+    assert_eq!(event["moved"].get("position"), None);
+
+    let nowhere = set(json!({"spec": {"radius": 5.0}})).await;
+    assert_eq!(refusal(&nowhere), (422, "Invalid"));
+    assert_eq!(nowhere.1["details"]["causes"][0]["field"], "spec.position");
+    assert_eq!(set(json!({"spec": {"filter": {}}})).await.0, 422, "that is the framework's own");
+    let (_, unchanged) = send(&admin, "GET", &path, Value::Null).await;
+    assert_eq!(unchanged["spec"].get("radius"), None);
+
+    drop(session);
+    // It is away as soon as its session knows.
+    let refused = loop {
+        match set(at(3.0)).await {
+            (200, _) => tokio::task::yield_now().await,
+            refused => break refused,
+        }
+    };
+    assert_eq!(refusal(&refused), (409, "NotConnected"));
+    cluster.running.shut_down().await.unwrap();
+}
+
 async fn ends(mut body: kube::client::Body) {
     until(&mut body, |event| event["error"]["reason"] == "Forbidden").await;
     let end = tokio::time::timeout(DEADLINE, body.frame()).await.expect("it ends");

@@ -302,6 +302,7 @@ async fn discovery_tells_what_there_is() {
             "applications",
             "applications/status",
             "frameworks",
+            "frameworks/position",
             "frameworks/status",
             "leases",
             "leases/acquire",

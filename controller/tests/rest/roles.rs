@@ -24,6 +24,7 @@ const EVERYWHERE: &str = "
     muster.dev/applications           -          GLW     GLWCUPDX   GLWCUPDX  GLWCUPDX  -
     muster.dev/applications/status    -          G       G          G         GUP       -
     muster.dev/frameworks             GLW        GLW     GLWDX      GLWDX     GLWDX     -
+    muster.dev/frameworks/position    C          -       C          C         C         -
     muster.dev/frameworks/status      G          G       G          G         GUP       -
     muster.dev/quotas                 -          GLW     GLW        GLW       GLWCUPDX  -
     muster.dev/quotas/status          -          G       G          G         GUP       -
@@ -68,6 +69,7 @@ const IN_LAB: &str = "
     muster.dev/applications           -          GLW     GLWCUPDX   GLWCUPDX  GLWCUPDX
     muster.dev/applications/status    -          G       G          G         G
     muster.dev/frameworks             GLW        GLW     GLWDX      GLWDX     GLWDX
+    muster.dev/frameworks/position    C          -       C          C         C
     muster.dev/frameworks/status      G          G       G          G         G
     muster.dev/quotas                 -          GLW     GLW        GLW       GLW
     muster.dev/quotas/status          -          G       G          G         G

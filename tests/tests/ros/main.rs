@@ -1,6 +1,7 @@
 //! Our ROS 1 client and master, and the agent's poses, sensors, drivers and tasks, against Debian's ROS 1: roscore, rospy, rostopic, rosnode.
 
 mod attacks;
+mod clicks;
 mod client;
 mod gate;
 mod master;

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from typing import Callable, Optional, Union
 
 from muster.errors import FrameworkError
-from muster.model import Offer, RescindReason, TaskStatus
+from muster.model import Offer, Position, RescindReason, TaskStatus
 
 log = logging.getLogger("muster")
 
@@ -75,6 +75,12 @@ class ExecutorLost:
 
 
 @dataclass(frozen=True)
+class Moved:
+    position: Optional[Position]
+    by: str
+
+
+@dataclass(frozen=True)
 class Failed:
     error: FrameworkError
 
@@ -87,7 +93,18 @@ class Deferred:
 
 
 Event = Union[
-    Registered, Reregistered, Lost, Offered, Rescinded, Updated, Message, NodeLost, ExecutorLost, Failed, Deferred
+    Registered,
+    Reregistered,
+    Lost,
+    Offered,
+    Rescinded,
+    Updated,
+    Message,
+    NodeLost,
+    ExecutorLost,
+    Moved,
+    Failed,
+    Deferred,
 ]
 
 

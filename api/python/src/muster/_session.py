@@ -226,10 +226,23 @@ class Session:
                 put(inbox.Message(said.executor, said.node, said.data))
         elif kind == "node_lost":
             put(inbox.NodeLost(event.node_lost.node, event.node_lost.message))
+        elif kind == "moved":
+            self._moved(event.moved)
         elif kind == "executor_lost":
             lost = event.executor_lost
             code = lost.exit_code if lost.HasField("exit_code") else None
             put(inbox.ExecutorLost(lost.executor, lost.node, code, lost.message))
+
+    def _moved(self, moved: pb.Moved) -> None:
+        """The next session says it as well."""
+        position = _wire.moved_to(moved)
+
+        def change(info: FrameworkInfo) -> FrameworkInfo:
+            anywhere = position is not None and position.radius is None
+            return replace(info, position=position, radius=None if anywhere else info.radius)
+
+        self._books.change(change)
+        self._books.inbox.put(inbox.Moved(position, moved.by))
 
     def _update(self, update: pb.Update) -> None:
         try:

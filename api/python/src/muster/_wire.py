@@ -16,6 +16,7 @@ from muster.errors import CallRefused, Cause, RefusalReason, WireError
 from muster.model import (
     DEFAULT_MAP,
     Compute,
+    Cost,
     Filter,
     FrameworkInfo,
     Launched,
@@ -65,6 +66,20 @@ def position(value: Position, default_radius: Optional[float]) -> pb.Position:
     if radius is not None:
         made.radius = radius
     return made
+
+
+def moved_to(value: pb.Moved) -> Optional[Position]:
+    if not value.HasField("position"):
+        return None
+    said = value.position
+    return Position(
+        x=said.x,
+        y=said.y,
+        z=said.z,
+        map=said.map or DEFAULT_MAP,
+        radius=said.radius if said.HasField("radius") else None,
+        cost=Cost(said.cost or Cost.DISTANCE.value),
+    )
 
 
 def _compute(value: Compute) -> pb.Compute:

@@ -272,6 +272,8 @@ class SchedulerDriver(Life):
             scheduler.node_lost(self, event.node, event.message)
         elif isinstance(event, inbox.ExecutorLost):
             scheduler.executor_lost(self, event.executor, event.node, event.exit_code, event.message)
+        elif isinstance(event, inbox.Moved):
+            scheduler.moved(self, event.position, event.by)
         elif isinstance(event, inbox.Deferred):
             event.run()
         else:

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Optional
 
 from muster._names import Foreign, adopt
-from muster.model import Offer, RescindReason, TaskStatus
+from muster.model import Offer, Position, RescindReason, TaskStatus
 
 if TYPE_CHECKING:
     from muster.driver import SchedulerDriver
@@ -66,6 +66,9 @@ class Scheduler:
 
     def node_lost(self, driver: SchedulerDriver, node: str, message: str) -> None:
         """A node with tasks of this framework cannot be reached."""
+
+    def moved(self, driver: SchedulerDriver, position: Optional[Position], by: str) -> None:
+        """Somebody else has set where the framework works (None: everywhere). Offers for the old position are void."""
 
     def executor_lost(
         self, driver: SchedulerDriver, executor: str, node: str, exit_code: Optional[int], message: str

@@ -363,6 +363,10 @@ impl Session {
                 self.inbox.lanes.told(direct);
                 return Ok(());
             }
+            Hear::Moved(moved) => {
+                self.identity.subscribe.position.clone_from(&moved.position);
+                Event::Moved(moved)
+            }
             Hear::NodeLost(lost) => Event::NodeLost(lost),
             Hear::ExecutorLost(lost) => {
                 self.inbox.lanes.lost(&lost.executor);

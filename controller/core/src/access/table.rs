@@ -71,6 +71,7 @@ pub(super) static TABLE: &[Row] = &[
     row("frameworks",              [READ,   READ,  END,   END,   END],   Namespace, Namespace),
     row("frameworks/status",       [GET,    GET,   GET,   GET,   EDIT],  Namespace, Cluster),
     row("frameworks/why",          [GET,    GET,   GET,   GET,   GET],   Namespace, Namespace),
+    row("frameworks/position",     [POST,   NONE,  POST,  POST,  POST],  Namespace, Namespace),
     row("frameworks/session",      [POST,   NONE,  POST,  POST,  POST],  Namespace, Namespace),
     row("configmaps",              [NONE,   READ,  ALL,   ALL,   ALL],   Namespace, Namespace),
     row("secrets",                 [NONE,   NONE,  ALL,   ALL,   ALL],   Namespace, Namespace),

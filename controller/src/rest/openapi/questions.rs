@@ -119,6 +119,13 @@ pub(super) fn of_kind(entry: &Entry, one: &str, paths: &mut Map<String, Value>) 
             sub("take", post("A person holds it, whoever did."));
             sub("return", post("The person gives it back."));
         }
+        ("Framework", _) => {
+            let number = || json!({"type": "number"});
+            let place = [("x", number()), ("y", number()), ("z", number()), ("map", text())];
+            let spec = [("position", object(&place)), ("radius", number()), ("cost", text())];
+            let body = object(&[("spec", object(&spec))]);
+            sub("position", vec![Operation::post("It works there from now on.", body)]);
+        }
         ("TaskSet", _) => {
             let replicas = object(&[("replicas", json!({"type": "integer"}))]);
             let scale = object(&[

@@ -37,6 +37,7 @@ use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use muster_api::id::TaskUid;
+use muster_api::kind::framework::FrameworkPosition;
 use muster_api::kind::task::Task;
 use muster_api::name::NodeName;
 use muster_api::wire::agent::v1::Message as AgentMessage;
@@ -55,6 +56,7 @@ use crate::objects;
 use crate::reconcile::desk::{Depth, FrameworkUid, Outlet, Request, View};
 use crate::reconcile::schedule;
 use crate::rest::failure::Failure;
+use crate::store::StoreError;
 
 /// The generated server side of the session.
 #[allow(clippy::all, clippy::allow_attributes, unreachable_pub, reason = "generated")]
@@ -119,6 +121,14 @@ struct Spoken {
     is_executor: bool,
 }
 
+/// Somebody else sets where a framework works.
+#[derive(Debug)]
+struct Move {
+    position: FrameworkPosition,
+    by: String,
+    answer: oneshot::Sender<Result<(), StoreError>>,
+}
+
 /// An open session.
 #[derive(Debug, Clone)]
 struct Open {
@@ -128,6 +138,7 @@ struct Open {
     /// It can dial agents.
     direct: bool,
     mailbox: Arc<Mailbox>,
+    moves: mpsc::Sender<Move>,
     /// For calls that come over HTTP.
     calls: mpsc::Sender<wire::Call>,
     /// Ends it.
@@ -228,6 +239,19 @@ impl Frameworks {
         if let Some(open) = lock(&self.open).get(uid) {
             open.mailbox.put(update);
         }
+    }
+
+    /// Sets where a framework works, and tells it. None: it is away.
+    pub(crate) async fn set_position(
+        &self,
+        uid: &str,
+        position: FrameworkPosition,
+        by: String,
+    ) -> Option<Result<(), StoreError>> {
+        let moves = lock(&self.open).get(uid)?.moves.clone();
+        let (answer, answered) = oneshot::channel();
+        moves.send(Move { position, by, answer }).await.ok()?;
+        answered.await.ok()
     }
 
     /// Tells a framework something. Lost when it is away.

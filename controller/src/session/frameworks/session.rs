@@ -1,6 +1,6 @@
 //! One framework's session, whatever carries it.
 //!
-//! One task a session. It has five sources in one select: calls, what the desk and executors say (the events channel),
+//! One task a session. It has six sources in one select: calls, where somebody else sets it to work, what the desk and executors say (the events channel),
 //! updates of tasks (the mailbox), the heartbeat, and the ends (cut off, transport closed, controller ending). Only this
 //! task writes to the transport; when the framework does not read, this task waits, and the desk cuts the session off
 //! once the events channel is full.
@@ -16,7 +16,7 @@ use std::time::Duration;
 use muster_api::kind::framework::{ACKNOWLEDGE_FINALIZER, FrameworkSpec};
 use muster_api::kind::task::Task;
 use muster_api::wire::framework::v1 as wire;
-use muster_api::wire::framework_session::{set_filter, set_position};
+use muster_api::wire::framework_session::{position_to_wire, set_filter, set_position};
 use muster_controller_core::access::Verb;
 use muster_controller_core::offer::DEFAULT_REFUSE;
 use tokio::sync::{mpsc, oneshot};
@@ -27,7 +27,7 @@ use wire::event::Event as Tell;
 
 use super::subscribe::{self, Guest};
 use super::{
-    CALLS, EVENTS, Frameworks, HEARTBEAT_EVERY, MAX_MESSAGE, Mailbox, Open, Unsent, convert,
+    CALLS, EVENTS, Frameworks, HEARTBEAT_EVERY, MAX_MESSAGE, Mailbox, Move, Open, Unsent, convert,
     launch, session_in,
 };
 use crate::audit::Line;
@@ -127,7 +127,8 @@ async fn serve(frameworks: Arc<Frameworks>, wire: Wire, guest: Guest) {
     let direct = session.guest.direct;
     let by = Arc::clone(&session.by);
     let whose = Arc::clone(&by);
-    let open = Open { outlet: outlet.clone(), by, direct, mailbox, calls, cut: cut.clone() };
+    let (moves, moved) = mpsc::channel(1);
+    let open = Open { outlet: outlet.clone(), by, direct, mailbox, moves, calls, cut: cut.clone() };
     frameworks.connect(&uid, &session_id, open);
     // After it is taken in: whoever writes that it is away looks first whether it is.
     let written = subscribe::write_connected(&frameworks, &session.guest, number).await;
@@ -139,7 +140,7 @@ async fn serve(frameworks: Arc<Frameworks>, wire: Wire, guest: Guest) {
         let (context, out) = (&frameworks.context, session.out.clone());
         let asked = session_in(key.namespace(), Some(&key.name));
         let revoked = auth::until_revoked(context, &whose, &asked);
-        let worked = pin!(session.work(&session_id, outlet, wire.calls, &mut told));
+        let worked = pin!(session.work(&session_id, outlet, (wire.calls, moved), &mut told));
         tokio::select! {
             worked = worked => worked,
             // Also of one that calls nothing, or does not read: with its session its tickets end.
@@ -172,7 +173,7 @@ impl Session {
         &mut self,
         session_id: &str,
         outlet: Outlet,
-        mut calls: mpsc::Receiver<wire::Call>,
+        (mut calls, mut moves): (mpsc::Receiver<wire::Call>, mpsc::Receiver<Move>),
         told: &mut mpsc::Receiver<wire::Event>,
     ) -> Result<(), Closed> {
         self.say(Tell::Subscribed(wire::Subscribed {
@@ -201,6 +202,8 @@ impl Session {
                     // The framework closed its side.
                     None => return Err(Closed),
                 },
+                // Cancel safe, as above.
+                Some(asked) = moves.recv() => self.be_moved(asked).await?,
                 // Cancel safe, as above.
                 Some(event) = told.recv() => {
                     outlet.taken(&event);
@@ -365,19 +368,44 @@ impl Session {
             return Ok(Some(convert::invalid(convert::causes("", &violations))));
         }
         let is_new = self.guest.spec != spec;
-        self.guest.spec = spec.clone();
-        let uid = Arc::clone(&self.guest.uid);
-        let (done, rescinded) = oneshot::channel();
-        self.ask(Request::Wish { uid, spec: Box::new(spec.clone()), done }).await?;
-        subscribe::write_spec(&self.frameworks.context, &self.guest.key, &self.guest.uid, &spec)
-            .await;
+        self.follow(spec).await?;
+        if let Err(error) = self.write_spec(&self.guest.spec).await {
+            // It holds for the offers; only the object shows the older wish until the next change.
+            tracing::warn!(framework = %self.guest.key, error = crate::app::chain(&error), "a wish is not written");
+        }
         if is_new {
             let Guest { key, uid, .. } = &self.guest;
             self.write_line(Verb::Update, "frameworks", (key, uid)).await;
         }
-        // Before the answer: who has moved hears nothing of the old place after it.
-        rescinded.await.map_err(|_| Closed)?;
         Ok(None)
+    }
+
+    /// Somebody else says where the framework works: it is told before it hears of offers there.
+    async fn be_moved(&mut self, asked: Move) -> Result<(), Closed> {
+        let spec = asked.position.of(&self.guest.spec);
+        let written = self.write_spec(&spec).await;
+        if written.is_ok() {
+            let position = position_to_wire(&spec);
+            self.follow(spec).await?;
+            self.say(Tell::Moved(wire::Moved { position, by: asked.by })).await?;
+        }
+        // Who asked may have left.
+        drop(asked.answer.send(written));
+        Ok(())
+    }
+
+    async fn write_spec(&self, spec: &FrameworkSpec) -> Result<(), StoreError> {
+        let Guest { key, uid, .. } = &self.guest;
+        subscribe::write_spec(&self.frameworks.context, key, uid, spec).await
+    }
+
+    /// From now on it is offered what this asks for, and what it was offered for its old wish does not hold any more.
+    async fn follow(&mut self, spec: FrameworkSpec) -> Result<(), Closed> {
+        self.guest.spec = spec.clone();
+        let uid = Arc::clone(&self.guest.uid);
+        let (done, rescinded) = oneshot::channel();
+        self.ask(Request::Wish { uid, spec: Box::new(spec), done }).await?;
+        rescinded.await.map_err(|_| Closed)
     }
 
     async fn decline(&self, decline: &wire::Decline) -> Result<Option<wire::Refusal>, Closed> {

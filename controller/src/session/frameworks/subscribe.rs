@@ -17,7 +17,7 @@ use crate::context::Context;
 use crate::objects::{self, FRAMEWORKS};
 use crate::reconcile::desk::FrameworkUid;
 use crate::rest::create;
-use crate::store::{Key, Stored};
+use crate::store::{Key, StoreError, Stored};
 
 /// Longest nonce: a random UUID has 36 characters.
 const MAX_NONCE: usize = 64;
@@ -197,23 +197,25 @@ pub(super) async fn write_connected(
 }
 
 /// Writes what a framework wants now.
+///
+/// # Errors
+///
+/// When the store fails.
 pub(super) async fn write_spec(
     context: &Context,
     key: &Key,
     uid: &FrameworkUid,
     spec: &FrameworkSpec,
-) {
-    let written = objects::change(&context.store, key, |stored, mut object: Framework| {
+) -> Result<(), StoreError> {
+    objects::change(&context.store, key, |stored, mut object: Framework| {
         if *stored.uid != **uid || object.spec == *spec {
             return None;
         }
         object.spec = spec.clone();
         Some(vec![objects::replace(stored, &object)])
-    });
-    if let Err(error) = written.await {
-        // It holds for the offers; only the object shows the older wish until the next change.
-        tracing::warn!(framework = %key, error = crate::app::chain(&error), "a wish is not written");
-    }
+    })
+    .await
+    .map(drop)
 }
 
 /// Writes whether a framework has a session, where its object says something else. Without one it is away from now on.
@@ -225,7 +227,7 @@ pub(crate) async fn write_presence(
     frameworks: &Frameworks,
     key: &Key,
     uid: &str,
-) -> Result<(), crate::store::StoreError> {
+) -> Result<(), StoreError> {
     let context = &frameworks.context;
     let now = context.clock.now();
     objects::change(&context.store, key, |stored, mut object: Framework| {
