@@ -1,6 +1,7 @@
 //! The Docker Engine of this machine, and one small image in it.
 
 use std::io::Write as _;
+use std::path::Path;
 use std::process::{Command, Output, Stdio};
 
 /// The image that [`image`] makes: a static busybox and its applets.
@@ -13,13 +14,29 @@ fn docker(args: &[&str]) -> Output {
         .expect("the docker client is installed (tests/run installs docker.io)")
 }
 
+/// The image that [`bare_image`] makes: nothing but the places where a node's own system is mounted.
+pub const BARE_IMAGE: &str = "muster-e2e/bare:1";
+
 /// Makes the image when it is not there; registries are not asked.
 ///
 /// # Panics
 ///
 /// When no engine answers, or busybox-static is not installed.
 pub fn image() {
-    if docker(&["image", "inspect", IMAGE]).status.success() {
+    import(IMAGE, root);
+}
+
+/// The same of an image whose programs are the node's, by mounts of its `/usr` and of what in `/etc` belongs to it.
+///
+/// # Panics
+///
+/// When no engine answers.
+pub fn bare_image() {
+    import(BARE_IMAGE, bare_root);
+}
+
+fn import(image: &str, root: fn() -> Vec<u8>) {
+    if docker(&["image", "inspect", image]).status.success() {
         return;
     }
     let engine = docker(&["version"]);
@@ -30,7 +47,7 @@ pub fn image() {
     );
     let tar = root();
     let mut import = Command::new("docker")
-        .args(["import", "-", IMAGE])
+        .args(["import", "-", image])
         .stdin(Stdio::piped())
         .stdout(Stdio::null())
         .spawn()
@@ -49,10 +66,23 @@ pub(crate) fn root() -> Vec<u8> {
     for applet in ["sh", "sleep", "awk", "echo", "cat", "true", "false"] {
         std::os::unix::fs::symlink("busybox", bin.join(applet)).expect("a new name");
     }
-    let tar = Command::new("tar")
-        .args(["-C", &root.path().display().to_string(), "-c", "."])
-        .output()
-        .expect("tar");
+    packed(root.path())
+}
+
+fn bare_root() -> Vec<u8> {
+    let root = tempfile::tempdir().expect("a temporary directory");
+    for name in ["usr", "etc", "tmp"] {
+        std::fs::create_dir(root.path().join(name)).expect("it is empty");
+    }
+    for name in ["bin", "lib", "lib64", "sbin"] {
+        std::os::unix::fs::symlink(format!("usr/{name}"), root.path().join(name))
+            .expect("a new name");
+    }
+    packed(root.path())
+}
+
+fn packed(root: &Path) -> Vec<u8> {
+    let tar = Command::new("tar").arg("-C").arg(root).args(["-c", "."]).output().expect("tar");
     assert!(tar.status.success(), "{}", String::from_utf8_lossy(&tar.stderr));
     tar.stdout
 }

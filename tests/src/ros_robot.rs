@@ -13,6 +13,15 @@ const ATTACK: &str = include_str!("../ros/attack.py");
 /// The robot, with more in its `agent.yaml`. Silence stops it only after minutes: what it is told does not hang on how busy the
 /// machine is.
 pub async fn join(ros: &Ros, more: Value) -> Cluster {
+    begin(ros, more, &[("--docker-socket", "none")]).await
+}
+
+/// The same, with this machine's Docker Engine.
+pub async fn join_with_docker(ros: &Ros, more: Value) -> Cluster {
+    begin(ros, more, &[]).await
+}
+
+async fn begin(ros: &Ros, more: Value, flags: &[(&str, &str)]) -> Cluster {
     let mut cluster = Cluster::start().await;
     let config = cluster.dir().join("agent.yaml");
     let mut settings = json!({"arRes": "base:Drive", "gate": {"drivers": [{
@@ -24,8 +33,9 @@ pub async fn join(ros: &Ros, more: Value) -> Cluster {
     }
     // JSON is YAML.
     std::fs::write(&config, settings.to_string()).expect("a directory");
-    let robot = AgentOptions::bare("robot").flag("--kind", "robot").flag("--docker-socket", "none");
+    let robot = AgentOptions::bare("robot").flag("--kind", "robot");
     let robot = robot.flag("--ros-host", "127.0.0.1").flag("--ros-master", &ros.master());
+    let robot = flags.iter().fold(robot, |robot, (flag, value)| robot.flag(flag, value));
     cluster.join(robot.flag("--config", &config.display().to_string())).await;
     cluster
 }

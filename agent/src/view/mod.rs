@@ -33,7 +33,7 @@ use crate::runtime::{Launch, Reached, Runtime};
 use crate::sensor::reading::Topic as Sensor;
 
 /// What the master knows, in the task's directory.
-const FILE: &str = "view";
+const FILE: &str = "ros-view";
 
 /// Between two tries.
 const AGAIN: Duration = Duration::from_secs(1);

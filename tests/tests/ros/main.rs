@@ -3,6 +3,7 @@
 mod attacks;
 mod clicks;
 mod client;
+mod containers;
 mod gate;
 mod master;
 mod pose;

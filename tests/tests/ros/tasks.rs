@@ -4,7 +4,7 @@ use muster_tests::{AgentOptions, Cluster, Ros, kernel, wait};
 use serde_json::{Value, json};
 
 /// Starts a node and sets a parameter, both with relative names.
-const LAUNCH: &str = r#"<launch>
+pub(crate) const LAUNCH: &str = r#"<launch>
   <param name="speed" value="0.5"/>
   <node pkg="rosout" type="rosout" name="logger"/>
 </launch>
@@ -33,7 +33,7 @@ fn launches(ros: &Ros, of: Value) -> Value {
 }
 
 /// Waits until a node answers at the robot's address, and has set its parameter.
-async fn there(ros: &Ros, namespace: &str) {
+pub(crate) async fn there(ros: &Ros, namespace: &str) {
     let node = format!("{namespace}/logger");
     wait::until(&node, async || {
         let nodes = ros.output("rosnode", &["list"]).await;

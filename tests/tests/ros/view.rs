@@ -7,7 +7,7 @@ use serde_json::{Value, json};
 
 use crate::gate::{fenced, told};
 
-const SENSOR: &str = "wheels:Odometry";
+pub(crate) const SENSOR: &str = "wheels:Odometry";
 
 async fn robot(ros: &Ros) -> Cluster {
     let sensors = json!([{"function": SENSOR, "ros1": "/odom"}]);
@@ -15,19 +15,22 @@ async fn robot(ros: &Ros) -> Cluster {
 }
 
 /// Two programs: one that says something, and `view.py`.
-fn views(ros: &Ros, speed: &str) -> Value {
+pub(crate) fn both(speed: &str) -> String {
     let script = concat!(env!("CARGO_MANIFEST_DIR"), "/ros/view.py");
     // A tool of ROS's ends when there is no master yet.
-    let both = format!(
+    format!(
         "until rostopic pub -r 5 /chatter std_msgs/String 'data: one'; do :; done & \
          exec /usr/bin/python3 {script} {speed}"
-    );
+    )
+}
+
+fn views(ros: &Ros, speed: &str) -> Value {
     let logs = ros.dir().join("tasks").display().to_string();
     json!({
         "ros": {"master": "View"},
         "resources": {"actuators": ["base:Drive"], "sensors": [SENSOR]},
         "run": {"process": {
-            "command": ["sh", "-c", both],
+            "command": ["sh", "-c", both(speed)],
             "env": [{"name": "ROS_LOG_DIR", "value": logs}],
         }},
         "gracePeriodSeconds": 0,
@@ -39,7 +42,7 @@ fn count(log: &str, word: &str) -> usize {
 }
 
 /// Waits until the task has said `word` so often.
-async fn said(cluster: &Cluster, task: &str, word: &str, times: usize) {
+pub(crate) async fn said(cluster: &Cluster, task: &str, word: &str, times: usize) {
     wait::until(word, async || {
         let log = cluster.try_task_log(task).await?;
         if count(&log, word) >= times { Ok(()) } else { Err(log) }
