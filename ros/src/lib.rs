@@ -12,6 +12,7 @@
 //! | [`tcpros`] | connection headers, frames |
 //! | [`node`] | a node: its slave API, its registrations, its subscriptions and publications |
 //! | [`peer`] | what other nodes say of themselves |
+//! | [`pace`] | how often others may call a server |
 //! | [`rate`] | how often a topic is published |
 //!
 //! ```text
@@ -31,6 +32,7 @@ pub mod master;
 pub mod message;
 pub mod name;
 pub mod node;
+pub mod pace;
 pub mod peer;
 mod queue;
 pub mod rate;

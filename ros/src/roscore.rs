@@ -16,6 +16,7 @@ use tokio::sync::Notify;
 use tokio::task::JoinSet;
 use tokio_util::task::AbortOnDropHandle;
 
+use crate::pace::Pace;
 use crate::registry::{Notice, Registry, Response};
 use crate::xmlrpc::http::{Handler, Uri, invoke, serve};
 use crate::xmlrpc::{self, Answer, Call, Fault, Value, write_call};
@@ -25,6 +26,13 @@ const AT_ONCE: usize = 64;
 
 /// Keeps what a master knows, before those who told it are answered. What is not kept is not answered as done.
 pub type Save = Box<dyn Fn(&str) -> io::Result<()> + Send + Sync>;
+
+/// What is different with one that others begin.
+#[derive(Default)]
+struct Kept {
+    save: Option<Save>,
+    pace: Option<Pace>,
+}
 
 /// A running master. When it is dropped, nobody answers any more.
 #[derive(Debug)]
@@ -59,10 +67,10 @@ impl Roscore {
     ///
     /// The listener has no address.
     pub fn start(listener: TcpListener, host: &str) -> io::Result<Roscore> {
-        Roscore::begin(listener, host, |_| {}, None)
+        Roscore::begin(listener, host, |_| {}, Kept::default())
     }
 
-    /// Goes on with what an earlier one knew, as that was last saved; what cannot be read is nothing.
+    /// Goes on with what an earlier one knew, as that was last saved; what cannot be read is nothing. It is called at this pace.
     ///
     /// # Errors
     ///
@@ -72,6 +80,7 @@ impl Roscore {
         host: &str,
         known: &str,
         save: Save,
+        pace: Pace,
     ) -> io::Result<Roscore> {
         let learn = |registry: &mut Registry| match xmlrpc::call(known) {
             // Whoever is named in it was told of it by the earlier one.
@@ -79,14 +88,14 @@ impl Roscore {
             Err(error) if known.is_empty() => tracing::debug!(%error, "a new master"),
             Err(error) => tracing::warn!(%error, "what a ROS master knew cannot be read"),
         };
-        Roscore::begin(listener, host, learn, Some(save))
+        Roscore::begin(listener, host, learn, Kept { save: Some(save), pace: Some(pace) })
     }
 
     fn begin(
         listener: TcpListener,
         host: &str,
         learn: impl FnOnce(&mut Registry),
-        save: Option<Save>,
+        Kept { save, pace }: Kept,
     ) -> io::Result<Roscore> {
         let uri = Uri { host: host.to_owned(), port: listener.local_addr()?.port() };
         let pid = i32::try_from(std::process::id()).unwrap_or(i32::MAX);
@@ -100,7 +109,7 @@ impl Roscore {
         });
         let handler: Arc<dyn Handler> = Arc::clone(&state) as _;
         let tasks =
-            [tokio::spawn(serve(listener, handler)), tokio::spawn(tell(Arc::clone(&state)))];
+            [tokio::spawn(serve(listener, handler, pace)), tokio::spawn(tell(Arc::clone(&state)))];
         Ok(Roscore { state, uri, _tasks: tasks.map(AbortOnDropHandle::new) })
     }
 

@@ -6,9 +6,11 @@ use std::io;
 use std::net::Ipv4Addr;
 use std::os::fd::{AsFd as _, OwnedFd};
 use std::sync::Arc;
+use std::time::Duration;
 
 use futures::future::{BoxFuture, FutureExt as _, select_all};
 use muster_failpoint::Failpoint;
+use muster_ros1::pace::Pace;
 use muster_ros1::roscore::{Roscore, Save};
 use muster_ros1::{Node, NodeOptions};
 use rustix::thread::{LinkNameSpaceType, move_into_link_name_space};
@@ -19,6 +21,11 @@ use super::{Plan, relay};
 use crate::driver::chain;
 use crate::durable::{self, Keep};
 use crate::ros::VIEW_PORT;
+
+/// How often a task may call the master and the node, and how often at once: they are the agent's, whose time is nobody's. A launch of
+/// a hundred nodes are some thousand calls.
+const CALLS_EVERY: Duration = Duration::from_millis(2);
+const CALLS_AT_ONCE: u32 = 4_000;
 
 /// Its node, in every view.
 const NODE: &str = "muster";
@@ -61,7 +68,8 @@ async fn view(plan: &Arc<Plan>) -> Result<Infallible, String> {
     let host = Ipv4Addr::LOCALHOST.to_string();
     let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, VIEW_PORT)).await;
     let listener = listener.map_err(|error| format!("127.0.0.1:{VIEW_PORT}: {error}"))?;
-    let master = Roscore::resume(listener, &host, &known(plan), save(plan));
+    let pace = Pace::new(CALLS_EVERY, CALLS_AT_ONCE);
+    let master = Roscore::resume(listener, &host, &known(plan), save(plan), pace.clone());
     let master = master.map_err(|error| error.to_string())?;
     let options = NodeOptions {
         name: NODE.to_owned(),
@@ -69,6 +77,7 @@ async fn view(plan: &Arc<Plan>) -> Result<Infallible, String> {
         host: Some(host),
         namespace: Some("/".to_owned()),
         stays: true,
+        pace: Some(pace),
         ..NodeOptions::default()
     };
     let node = Node::start(options).await.map_err(|error| chain(&error))?;

@@ -39,6 +39,7 @@ use crate::env::{self, Environment};
 use crate::master::Master;
 use crate::message::{Message, Type, describe};
 use crate::name::{NameError, Resolver};
+use crate::pace::Pace;
 use crate::xmlrpc::Value;
 use crate::xmlrpc::http::{Uri, UriError, serve};
 use bus::Bus;
@@ -63,6 +64,8 @@ pub struct NodeOptions {
     pub remappings: Vec<(String, String)>,
     /// Whoever wants this node to end (anybody may say so) is refused.
     pub stays: bool,
+    /// How often others may call it; none: as often as they like.
+    pub pace: Option<Pace>,
 }
 
 /// Why a node does not start, or does not take a topic.
@@ -218,7 +221,7 @@ impl Node {
         });
         let slave = Arc::new(slave::Slave(Arc::clone(&shared)));
         let tasks = [
-            tokio::spawn(serve(calls, slave)),
+            tokio::spawn(serve(calls, slave, options.pace)),
             tokio::spawn(publication::serve(subscribers, Arc::clone(&shared))),
             tokio::spawn(registrar::run(Arc::clone(&shared))),
         ];

@@ -11,6 +11,8 @@ use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::Semaphore;
 use tokio::task::JoinSet;
 
+use crate::pace::Pace;
+
 use super::{Answer, Call, Fault, Malformed, Value, answer, call, write_answer, write_call};
 
 /// What a master may answer: the state of a system with ten thousand topics takes two.
@@ -174,8 +176,8 @@ pub trait Handler: Send + Sync + 'static {
     fn handle(&self, call: Call) -> Answer;
 }
 
-/// Serves calls until dropped.
-pub async fn serve(listener: TcpListener, handler: Arc<dyn Handler>) {
+/// Serves calls until dropped; a connection and a call are a turn each of the pace.
+pub async fn serve(listener: TcpListener, handler: Arc<dyn Handler>, pace: Option<Pace>) {
     let room = Arc::new(Semaphore::new(AT_ONCE));
     let mut connections = JoinSet::new();
     loop {
@@ -186,11 +188,15 @@ pub async fn serve(listener: TcpListener, handler: Arc<dyn Handler>) {
             tokio::time::sleep(Duration::from_millis(50)).await;
             continue;
         };
+        if let Some(pace) = &pace {
+            pace.turn().await;
+        }
         drop(stream.set_nodelay(true));
-        let handler = Arc::clone(&handler);
+        let (handler, pace) = (Arc::clone(&handler), pace.clone());
         connections.spawn(async move {
-            let service =
-                hyper::service::service_fn(|request| respond(Arc::clone(&handler), request));
+            let service = hyper::service::service_fn(|request| {
+                respond(Arc::clone(&handler), pace.clone(), request)
+            });
             let connection = hyper::server::conn::http1::Builder::new()
                 .timer(TokioTimer::new())
                 .header_read_timeout(IDLE)
@@ -203,9 +209,13 @@ pub async fn serve(listener: TcpListener, handler: Arc<dyn Handler>) {
 
 async fn respond(
     handler: Arc<dyn Handler>,
+    pace: Option<Pace>,
     request: Request<hyper::body::Incoming>,
 ) -> Result<Response<Full<Bytes>>, hyper::http::Error> {
     let refused = |status| Response::builder().status(status).body(Full::default());
+    if let Some(pace) = pace {
+        pace.turn().await;
+    }
     if request.method() != Method::POST {
         return refused(StatusCode::METHOD_NOT_ALLOWED);
     }
@@ -257,8 +267,8 @@ mod tests {
     async fn echo() -> (Uri, tokio_util::task::AbortOnDropHandle<()>) {
         let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
         let port = listener.local_addr().unwrap().port();
-        let server =
-            tokio_util::task::AbortOnDropHandle::new(tokio::spawn(serve(listener, Arc::new(Echo))));
+        let serve = serve(listener, Arc::new(Echo), None);
+        let server = tokio_util::task::AbortOnDropHandle::new(tokio::spawn(serve));
         (Uri { host: "127.0.0.1".to_owned(), port }, server)
     }
 
