@@ -6,13 +6,13 @@ pub mod probe;
 pub mod reschedule;
 pub mod ros;
 pub(super) mod rules;
+mod run;
+mod status;
 #[cfg(test)]
 mod tests;
 
 use std::collections::BTreeMap;
 
-use jiff::Timestamp;
-use k8s_openapi::apimachinery::pkg::apis::meta::v1::{MicroTime, Time};
 use kube::CustomResource;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -20,14 +20,20 @@ use serde::{Deserialize, Serialize};
 pub use config::{EnvFrom, EnvSource, Files};
 pub use reschedule::{EarlierTry, Outlook, Over, Reschedule};
 pub use ros::RosSpec;
+pub use run::{
+    ContainerRun, EnvVar, ExecutorRun, Mount, Network, ProcessNetwork, ProcessRun, PullPolicy, Run,
+    StopSignal,
+};
+pub use status::{
+    COMPLETE, DEADLINE_EXCEEDED, FAILED, LIVENESS_FAILED, NODE_MAINTENANCE, NOT_READY, NodeRefusal,
+    PLACED, PREEMPTED, PREEMPTING, STARTING_UP, STARTUP_FAILED, StopOrder, TaskLease, TaskStatus,
+    TaskUsage,
+};
 
 use super::node::{NodeKind, Taint, TaintEffect};
 use super::{KindInfo, admit_spec};
-use crate::condition::{self, Condition};
 use crate::duration::Span;
-use crate::id::Epoch;
 use crate::name::FunctionName;
-use crate::phase::TaskPhase;
 use crate::pose::OperationPosition;
 use crate::quantity::{Bytes, MilliCpu};
 use crate::resource::Compute;
@@ -81,6 +87,10 @@ pub struct TaskSpec {
     /// Seconds between asking the task to end and killing it.
     #[serde(default = "default_grace")]
     pub grace_period_seconds: u32,
+    /// The signal that asks it to end, to every process of it. SIGINT is what nodes of ROS 1 leave their master at; what a
+    /// shell has started in the background does not hear it.
+    #[serde(default, skip_serializing_if = "StopSignal::is_default")]
+    pub stop_signal: StopSignal,
     /// What happens when the node loses the controller; the default is Stop after 30 s for a task
     /// with actuators and Keep for others.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -339,176 +349,6 @@ pub struct IoLimits {
     pub write_bps: Option<Bytes>,
 }
 
-/// The program: exactly one of the three.
-#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(rename_all = "camelCase", deny_unknown_fields, default)]
-pub struct Run {
-    /// A container of the node's Docker Engine.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub container: Option<ContainerRun>,
-    /// A process of the node itself.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub process: Option<ProcessRun>,
-    /// Work that an executor does which runs on the node already.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub executor: Option<ExecutorRun>,
-}
-
-/// Work for an executor: a task of the same namespace that stays alive on the node and runs many tasks itself
-/// (Avalon, IV-B). The agent hands the work over by the executor's Unix socket, and the executor's limits grow by
-/// what this task reserves.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(rename_all = "camelCase", deny_unknown_fields)]
-pub struct ExecutorRun {
-    /// Name of the executor's Task.
-    pub task: String,
-    /// What the executor is told; the controller does not look into it.
-    #[serde(default, skip_serializing_if = "serde_json::Map::is_empty")]
-    pub data: serde_json::Map<String, serde_json::Value>,
-}
-
-/// A container.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(rename_all = "camelCase", deny_unknown_fields)]
-pub struct ContainerRun {
-    /// The image.
-    pub image: String,
-    /// Replaces the image's entry point.
-    #[serde(default, skip_serializing_if = "Vec::is_empty")]
-    pub command: Vec<String>,
-    /// Replaces the image's arguments.
-    #[serde(default, skip_serializing_if = "Vec::is_empty")]
-    pub args: Vec<String>,
-    /// Environment.
-    #[serde(default, skip_serializing_if = "Vec::is_empty")]
-    #[schemars(extend("x-kubernetes-list-type" = "map", "x-kubernetes-list-map-keys" = ["name"]))]
-    pub env: Vec<EnvVar>,
-    /// Whole ConfigMaps and Secrets as environment.
-    #[serde(default, skip_serializing_if = "Vec::is_empty")]
-    pub env_from: Vec<EnvFrom>,
-    /// ConfigMaps and Secrets as files.
-    #[serde(default, skip_serializing_if = "Vec::is_empty")]
-    #[schemars(extend("x-kubernetes-list-type" = "map", "x-kubernetes-list-map-keys" = ["mountPath"]))]
-    pub files: Vec<Files>,
-    /// Working directory in the container.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub working_dir: Option<String>,
-    /// Directories of the node that the container sees.
-    #[serde(default, skip_serializing_if = "Vec::is_empty")]
-    #[schemars(extend("x-kubernetes-list-type" = "map", "x-kubernetes-list-map-keys" = ["mountPath"]))]
-    pub mounts: Vec<Mount>,
-    /// The container's network.
-    #[serde(default)]
-    pub network: Network,
-    /// When the image is pulled.
-    #[serde(default)]
-    pub pull_policy: PullPolicy,
-    /// The user that it runs as, `UID` or `UID:GID`: names mean something inside of an image only. None: the image's, which
-    /// is root where the image says nothing.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub user: Option<String>,
-}
-
-/// A process.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(rename_all = "camelCase", deny_unknown_fields)]
-pub struct ProcessRun {
-    /// The program (looked up in PATH when it has no `/`) and its first arguments; passed as it
-    /// is, without a shell.
-    pub command: Vec<String>,
-    /// More arguments.
-    #[serde(default, skip_serializing_if = "Vec::is_empty")]
-    pub args: Vec<String>,
-    /// Environment, beside the agent's PATH and the MUSTER_ variables.
-    #[serde(default, skip_serializing_if = "Vec::is_empty")]
-    #[schemars(extend("x-kubernetes-list-type" = "map", "x-kubernetes-list-map-keys" = ["name"]))]
-    pub env: Vec<EnvVar>,
-    /// Whole ConfigMaps and Secrets as environment.
-    #[serde(default, skip_serializing_if = "Vec::is_empty")]
-    pub env_from: Vec<EnvFrom>,
-    /// ConfigMaps and Secrets as files.
-    #[serde(default, skip_serializing_if = "Vec::is_empty")]
-    #[schemars(extend("x-kubernetes-list-type" = "map", "x-kubernetes-list-map-keys" = ["mountPath"]))]
-    pub files: Vec<Files>,
-    /// Working directory; none: a directory of the task's own.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub working_dir: Option<String>,
-    /// The user it runs as, a name or a number; none: the agent's.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub user: Option<String>,
-    /// Its network: the node's, or none but a loopback of its own, so that it reaches nobody and is reached by nobody. A
-    /// program that is to be held in needs a `user`, too: root can leave.
-    #[serde(default, skip_serializing_if = "ProcessNetwork::is_default")]
-    pub network: ProcessNetwork,
-}
-
-/// A program's network.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
-pub enum ProcessNetwork {
-    /// The node's own network.
-    #[default]
-    Host,
-    /// Loopback only; shared memory and message queues of System V are its own as well.
-    None,
-}
-
-impl ProcessNetwork {
-    fn is_default(&self) -> bool {
-        *self == ProcessNetwork::default()
-    }
-}
-
-/// A variable of a task's environment.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
-#[serde(rename_all = "camelCase", deny_unknown_fields)]
-pub struct EnvVar {
-    /// Name.
-    pub name: String,
-    /// Value.
-    #[serde(default)]
-    pub value: String,
-    /// Where the value comes from instead.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub value_from: Option<EnvSource>,
-}
-
-/// A directory or file of the node that a container sees.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
-#[serde(rename_all = "camelCase", deny_unknown_fields)]
-pub struct Mount {
-    /// Absolute path on the node.
-    pub host_path: String,
-    /// Absolute path in the container.
-    pub mount_path: String,
-    /// The container cannot write to it.
-    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
-    pub read_only: bool,
-}
-
-/// A container's network.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
-pub enum Network {
-    /// The node's own network.
-    #[default]
-    Host,
-    /// Loopback only.
-    None,
-    /// The engine's default bridge.
-    Bridge,
-}
-
-/// When an image is pulled.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
-pub enum PullPolicy {
-    /// When the node does not have it.
-    #[default]
-    IfNotPresent,
-    /// Before every start.
-    Always,
-    /// Not at all; the node must have it.
-    Never,
-}
-
 /// What happens when the program ends.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 pub enum RestartPolicy {
@@ -563,232 +403,6 @@ impl TaskSpec {
             NodeChoice::Cloud => kind == NodeKind::Cloud,
         }
     }
-}
-
-/// What has become of a task.
-#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(rename_all = "camelCase", default, remote = "Self")]
-pub struct TaskStatus {
-    /// Where it is in its life.
-    pub phase: TaskPhase,
-    /// The node it is placed on.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub node: Option<String>,
-    /// The score of that node when it was placed: metres or seconds, by `placement.cost`; none for
-    /// a cloud node or a task without an operation position.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub score: Option<f64>,
-    /// The lease that came with the placement.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub lease: Option<TaskLease>,
-    /// Whether its start-up and readiness probes say that it can serve, true only while it runs; none: it has neither.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub ready: Option<bool>,
-    /// Since when `ready` is true, by the controller's clock.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub ready_at: Option<MicroTime>,
-    /// Number of the current attempt; 1 is the first, 0: none yet.
-    pub attempt: u32,
-    /// How the last attempt that ended ended.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub exit_code: Option<i32>,
-    /// The signal that ended it.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub signal: Option<i32>,
-    /// Why the task is in this phase, one CamelCase word.
-    #[serde(skip_serializing_if = "String::is_empty")]
-    pub reason: String,
-    /// Why, in a sentence.
-    #[serde(skip_serializing_if = "String::is_empty")]
-    pub message: String,
-    /// When it was placed.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub bound_at: Option<MicroTime>,
-    /// When the current or last attempt started.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub started_at: Option<MicroTime>,
-    /// When the last attempt ended.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub finished_at: Option<MicroTime>,
-    /// What it uses, read from the kernel, as far as it is written down.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub usage: Option<TaskUsage>,
-    /// Why it is not placed, per node (invariant 6).
-    #[serde(skip_serializing_if = "Vec::is_empty")]
-    pub why: Vec<NodeRefusal>,
-    /// The node where tasks are being ended to make room for this one.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub nominated_node: Option<String>,
-    /// The controller wants the task to end, and keeps its object.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub stop: Option<StopOrder>,
-    /// Number of the agent's newest report that is in here: reports are applied once.
-    #[serde(skip_serializing_if = "is_zero")]
-    pub report_sequence: u64,
-    /// How many attempts have failed on this node.
-    #[serde(skip_serializing_if = "is_none_yet")]
-    pub failed_attempts: u32,
-    /// The nodes that were tried before, the last one last; of many the newest ten.
-    #[serde(skip_serializing_if = "Vec::is_empty")]
-    pub earlier: Vec<EarlierTry>,
-    /// How many attempts have failed on all nodes before this one.
-    #[serde(skip_serializing_if = "is_none_yet")]
-    pub attempts_used: u32,
-    /// When it was placed for the first time, where it has been on other nodes before.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub first_bound_at: Option<MicroTime>,
-    /// It is not placed before.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub not_before: Option<MicroTime>,
-    /// `Placed`, `Ready`; of a task that has ended `Complete` or `Failed`. They follow from the other fields: they are
-    /// written whenever those are, and not read back (see [`TaskStatus::conditions`]).
-    #[serde(skip_deserializing, skip_serializing_if = "Vec::is_empty")]
-    #[schemars(extend("x-kubernetes-list-type" = "map", "x-kubernetes-list-map-keys" = ["type"]))]
-    pub conditions: Vec<Condition>,
-}
-
-impl Serialize for TaskStatus {
-    fn serialize<S: serde::Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        // The derived function, with what follows from the rest.
-        let shown = TaskStatus { conditions: self.conditions(), ..self.clone() };
-        TaskStatus::serialize(&shown, serializer)
-    }
-}
-
-impl<'de> Deserialize<'de> for TaskStatus {
-    fn deserialize<D: serde::Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-        TaskStatus::deserialize(deserializer)
-    }
-}
-
-impl TaskStatus {
-    /// What the status says, as conditions: for clients that wait for these.
-    #[must_use]
-    pub fn conditions(&self) -> Vec<Condition> {
-        let since = |time: &Option<MicroTime>| {
-            time.as_ref().map(|t| Time(Timestamp::from_second(t.0.as_second()).unwrap_or(t.0)))
-        };
-        let of = |r#type: &str, holds: bool, reason: &str, time: &Option<MicroTime>| Condition {
-            last_transition_time: since(time),
-            ..Condition::new(r#type, holds, reason, "")
-        };
-        let ready = self.is_ready();
-        let reason =
-            if ready || !self.reason.is_empty() { &*self.reason } else { self.phase.as_str() };
-        let times = if ready {
-            [&self.ready_at, &self.started_at]
-        } else {
-            [&self.finished_at, &self.bound_at]
-        };
-        let [first, second] = times;
-        let time = if first.is_some() { first } else { second };
-        let mut conditions = vec![
-            of(PLACED, self.node.is_some(), "", &self.bound_at),
-            of(condition::READY, ready, reason, time),
-        ];
-        match self.phase {
-            TaskPhase::Succeeded => {
-                conditions.push(of(COMPLETE, true, &self.reason, &self.finished_at))
-            }
-            TaskPhase::Failed => conditions.push(of(FAILED, true, &self.reason, &self.finished_at)),
-            _ => {}
-        }
-        conditions
-    }
-
-    /// Whether the task serves: it runs, and its probes, if it has some, say so.
-    #[must_use]
-    pub fn is_ready(&self) -> bool {
-        self.phase == TaskPhase::Running && self.ready != Some(false)
-    }
-
-    /// Takes what its node says of its probes, in the phase that it has now.
-    pub fn set_ready(&mut self, ready: Option<bool>, now: MicroTime) {
-        self.ready = ready.map(|ready| ready && self.phase == TaskPhase::Running);
-        match self.ready {
-            Some(true) => drop(self.ready_at.get_or_insert(now)),
-            Some(false) | None => self.ready_at = None,
-        }
-    }
-}
-
-#[expect(clippy::trivially_copy_pass_by_ref, reason = "serde passes references")]
-fn is_zero(n: &u64) -> bool {
-    *n == 0
-}
-
-#[expect(clippy::trivially_copy_pass_by_ref, reason = "serde passes references")]
-fn is_none_yet(n: &u32) -> bool {
-    *n == 0
-}
-
-/// An order of the controller to end a task; it is never taken back.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
-#[serde(rename_all = "camelCase")]
-pub struct StopOrder {
-    /// Why, one CamelCase word; the reason of the task's end.
-    pub reason: String,
-    /// Why, in a sentence.
-    pub message: String,
-    /// When it was given.
-    pub at: MicroTime,
-}
-
-/// Condition of a task that is on a node.
-pub const PLACED: &str = "Placed";
-/// Condition of a task that has ended with success.
-pub const COMPLETE: &str = "Complete";
-/// Condition of a task that has ended without success.
-pub const FAILED: &str = "Failed";
-
-/// Reason of a task that waits until others have ended to make room for it.
-pub const PREEMPTING: &str = "Preempting";
-/// Reason of a task that was ended to make room for one of more priority.
-pub const PREEMPTED: &str = "Preempted";
-/// Reason of a task whose node is in a maintenance window that drains it.
-pub const NODE_MAINTENANCE: &str = "NodeMaintenance";
-/// Reason of a task whose `activeDeadlineSeconds` have passed.
-pub const DEADLINE_EXCEEDED: &str = "DeadlineExceeded";
-/// Reason of a running task whose start-up probe has not succeeded yet.
-pub const STARTING_UP: &str = "StartingUp";
-/// Reason of a running task whose readiness probe does not succeed.
-pub const NOT_READY: &str = "NotReady";
-/// Reason of an attempt that is or was ended because its liveness probe failed.
-pub const LIVENESS_FAILED: &str = "LivenessFailed";
-/// Reason of an attempt that is or was ended because its start-up probe failed.
-pub const STARTUP_FAILED: &str = "StartupFailed";
-
-/// The lease that a task holds.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
-#[serde(rename_all = "camelCase")]
-pub struct TaskLease {
-    /// Name of the Lease object.
-    pub name: String,
-    /// Number of the grant.
-    pub epoch: Epoch,
-}
-
-/// What a task uses.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
-#[serde(rename_all = "camelCase")]
-pub struct TaskUsage {
-    /// Mean over the last sampling window.
-    pub cpu: MilliCpu,
-    /// Now.
-    pub memory: Bytes,
-}
-
-/// Why one node does not take a task.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
-#[serde(rename_all = "camelCase")]
-pub struct NodeRefusal {
-    /// The node; empty: said of the whole cluster.
-    #[serde(default, skip_serializing_if = "String::is_empty")]
-    pub node: String,
-    /// The filter that refuses it, one CamelCase word.
-    pub reason: String,
-    /// What would have to change, in a sentence.
-    pub message: String,
 }
 
 pub(super) const INFO: KindInfo = KindInfo {

@@ -4,7 +4,7 @@ use serde_json::Value;
 
 use super::{
     Cost, DisconnectPolicy, EnvVar, MAX_GRACE_SECONDS, NodeChoice, OnDisconnect, Resources,
-    RestartPolicy, Run, TaskSpec, TolerationOperator,
+    RestartPolicy, Run, StopSignal, TaskSpec, TolerationOperator,
 };
 use crate::name::check_name;
 use crate::quantity::{Bytes, MilliCpu};
@@ -23,6 +23,11 @@ pub(in crate::kind) fn rules(spec: &TaskSpec, violations: &mut Violations) {
         violations
             .invalid("spec.restartPolicy", "an executor's work is not run again by itself")
             .suggest("leave it out, or set Never");
+    }
+    if spec.run.executor.is_some() && spec.stop_signal != StopSignal::default() {
+        violations
+            .forbidden("spec.stopSignal", "an executor ends its work as it likes")
+            .suggest("leave it out");
     }
     if spec.active_deadline_seconds == Some(0) {
         violations

@@ -1,10 +1,11 @@
 //! Admission of tasks, and the rules of their parts.
 
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::MicroTime;
 use serde_json::{Value, json};
 
-use crate::kind::{admit, admit_change, find};
-
 use super::*;
+use crate::kind::{admit, admit_change, find};
+use crate::phase::TaskPhase;
 
 fn task(spec: Value) -> Value {
     json!({"apiVersion": crate::API_VERSION, "kind": "Task", "metadata": {"name": "t"}, "spec": spec})
