@@ -127,6 +127,7 @@ pub(crate) fn launch(id: AttemptId, assignment: &Assignment, around: &Surroundin
             || resources.memory.is_some()
             || resources.pids.is_some()
             || resources.io.is_some(),
+        stop_signal: spec.stop_signal,
         grace_ms: u64::from(spec.grace_period_seconds) * 1_000,
         stop_after_ms: desired(spec, None).stop_after_ms,
         id,

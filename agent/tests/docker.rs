@@ -194,6 +194,22 @@ fn a_container_runs_and_its_exit_code_is_reported() {
 }
 
 #[test]
+fn a_container_is_asked_to_end_by_the_signal_that_it_names() {
+    let _cleanup = Cleanup(vec!["d-named"]);
+    let controller = Controller::start();
+    let agent = start(&controller);
+    let trap = "trap '' TERM; trap 'exit 9' INT; : > $MUSTER_RUN_DIR/ready";
+    let mut spec = sh(&format!("{trap}; while :; do sleep 0.05; done"));
+    spec["stopSignal"] = json!("SIGINT");
+    controller.assign("d-named", spec);
+    let ready = agent.task_dir("d-named").join("run/ready");
+    until("its trap", || ready.exists().then_some(()));
+    controller.stop("d-named", 300_000);
+    let end = controller.wait_end("d-named");
+    assert_eq!((end.exit_code, end.signal), (Some(9), None), "{end:?}");
+}
+
+#[test]
 fn limits_are_the_kernels() {
     let _cleanup = Cleanup(vec!["d-spin", "d-fat-1", "d-fat-2", "d-fat-3"]);
     let controller = Controller::start();

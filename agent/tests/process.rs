@@ -207,6 +207,23 @@ fn what_a_program_leaves_behind_ends_with_it() {
 }
 
 #[test]
+fn a_program_is_asked_to_end_by_the_signal_that_it_names() {
+    let controller = Controller::start();
+    let agent = Agent::start(&controller);
+    let script =
+        "trap '' TERM; trap 'exit 9' INT; : > $MUSTER_RUN_DIR/ready; while :; do sleep 0.05; done";
+    let mut spec = sh(script);
+    spec["stopSignal"] = json!("SIGINT");
+    spec["gracePeriodSeconds"] = json!(300);
+    controller.assign("named", spec);
+    let ready = agent.task_dir("named").join("run/ready");
+    until("its trap", || ready.exists().then_some(()));
+    controller.stop("named", 300_000);
+    let end = controller.wait_end("named");
+    assert_eq!((end.exit_code, end.signal), (Some(9), None), "{end:?}");
+}
+
+#[test]
 fn a_polite_program_ends_within_its_grace() {
     let controller = Controller::start();
     let agent = Agent::start(&controller);

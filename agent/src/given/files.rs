@@ -283,6 +283,7 @@ fn link(dir: &Path, work: &Path, config: &proto::Config) -> Result<(), Failure> 
 
 #[cfg(test)]
 mod tests {
+    use muster_api::kind::task::StopSignal;
     use std::collections::BTreeMap;
     use std::sync::Arc;
 
@@ -312,6 +313,7 @@ mod tests {
             given: Some(Arc::new(config)),
             limits: Limits::default(),
             promised: false,
+            stop_signal: StopSignal::default(),
             grace_ms: 0,
             stop_after_ms: None,
         }

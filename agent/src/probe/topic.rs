@@ -181,6 +181,7 @@ fn look(counting: &Counting) -> Seen {
 
 #[cfg(test)]
 mod tests {
+    use muster_api::kind::task::StopSignal;
     use std::sync::Arc;
 
     use muster_api::id::TaskUid;
@@ -209,6 +210,7 @@ mod tests {
             given: Some(Arc::new(proto::Config { variables, files: Vec::new(), unresolved: None })),
             limits: Limits::default(),
             promised: false,
+            stop_signal: StopSignal::default(),
             grace_ms: 0,
             stop_after_ms: None,
         }

@@ -5,6 +5,7 @@ use std::fmt;
 use std::path::PathBuf;
 
 use muster_api::id::TaskUid;
+use muster_api::kind::task::StopSignal;
 use serde::{Deserialize, Serialize};
 
 use crate::given::Given;
@@ -154,7 +155,10 @@ pub(crate) struct Launch {
     /// Whether a limit is a promise to the user: without enforcement the launch is refused. The
     /// caps that the agent adds on its own are dropped instead.
     pub(crate) promised: bool,
-    /// How long between SIGTERM and SIGKILL when it is ended without an order, milliseconds.
+    /// What asks it to end.
+    #[serde(default)]
+    pub(crate) stop_signal: StopSignal,
+    /// How long between that and SIGKILL when it is ended without an order, milliseconds.
     pub(crate) grace_ms: u64,
     /// `onDisconnect: Stop`: ended after this long without contact, milliseconds.
     pub(crate) stop_after_ms: Option<u64>,

@@ -33,7 +33,7 @@ pub(super) fn guard(
             dir.write_disconnected()?;
             ladder.stop(StopTimes { signal_ms: 0, kill_ms: order.launch.grace_ms });
         }
-        let pause = ladder.step(&reach).map(|pause| Timespec {
+        let pause = ladder.step(&reach, order.launch.stop_signal).map(|pause| Timespec {
             tv_sec: i64::try_from(pause.as_secs()).unwrap_or(i64::MAX),
             tv_nsec: pause.subsec_nanos().into(),
         });

@@ -94,6 +94,7 @@ pub(super) fn watch(
         contact: Contact::open(order).map_err(ShimError::system("watch the contact"))?,
         disconnected: false,
     };
+    let stop = order.launch.stop_signal;
     // An order may have come before anybody listened.
     watch.look_for_order();
     let end = loop {
@@ -106,9 +107,9 @@ pub(super) fn watch(
                     watch.ladder.kill();
                 }
                 watch.ladder.signal_now();
-                watch.ladder.step(reach)
+                watch.ladder.step(reach, stop)
             }
-            _ => watch.ladder.step(reach),
+            _ => watch.ladder.step(reach, stop),
         };
         let again = (!birth.tell()).then_some(FULL_PAUSE);
         let pause = [pause, again].into_iter().flatten().min();

@@ -50,12 +50,14 @@ pub(crate) async fn there(ros: &Ros, namespace: &str) {
 async fn what_roslaunch_starts_is_in_the_robots_graph() {
     let ros = Ros::start().await;
     let cluster = one_robot(&ros).await;
-    let patrol = cluster.create("patrol", launches(&ros, json!({"namespace": "/patrol"}))).await;
+    let mut patrol = launches(&ros, json!({"namespace": "/patrol"}));
+    patrol["stopSignal"] = json!("SIGINT");
+    let patrol = cluster.create("patrol", patrol).await;
     there(&ros, "/patrol").await;
     // Where nothing is said of a namespace it is the agent's; and a master may be named.
     cluster.create("other", launches(&ros, json!({"master": ros.master()}))).await;
     there(&ros, "/robot").await;
-    // All of it ends, and nothing of the other.
+    // All of it ends, in order, and nothing of the other.
     cluster.delete("patrol").await;
     let uid = patrol.metadata.uid.expect("set by the server");
     wait::until("its nodes' end", async || {
@@ -63,5 +65,7 @@ async fn what_roslaunch_starts_is_in_the_robots_graph() {
         if left.is_empty() { Ok(()) } else { Err(format!("{left:?}")) }
     })
     .await;
+    let nodes = ros.output("rosnode", &["list"]).await;
+    assert!(!nodes.contains("/patrol/"), "{nodes}");
     there(&ros, "/robot").await;
 }

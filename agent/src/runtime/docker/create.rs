@@ -81,6 +81,7 @@ pub(super) fn body(launch: &Launch, config: &DockerConfig) -> Result<ContainerCr
         working_dir: container.working_dir.clone(),
         user: container.run_as.clone(),
         env: Some(env.iter().map(|(name, value)| format!("{name}={value}")).collect()),
+        stop_signal: Some(launch.stop_signal.name().to_owned()),
         labels: Some(labels(launch, config)),
         host_config: Some(host(launch, container, config)?),
         ..ContainerCreateBody::default()

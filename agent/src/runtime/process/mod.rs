@@ -45,6 +45,7 @@ use muster_agent_core::desired::StopTimes;
 use muster_agent_core::observed::{End, Exit, Loss, Observed, Started};
 use muster_agent_core::workload::Failure;
 use muster_api::id::TaskUid;
+use muster_api::kind::task::StopSignal;
 use muster_failpoint::{Failpoint, Step, reach};
 use rustix::process::{PidfdFlags, Signal, WaitId, WaitIdOptions};
 use tokio::io::AsyncReadExt;
@@ -147,7 +148,7 @@ impl ProcessRuntime {
                 if reach.is_empty() {
                     break;
                 }
-                std::thread::sleep(ladder.step(&reach).unwrap_or_default());
+                std::thread::sleep(ladder.step(&reach, StopSignal::default()).unwrap_or_default());
             }
             if let Err(error) = group.remove() {
                 tracing::warn!(group = %name, %error, "the group could not be removed");
@@ -271,7 +272,7 @@ impl ProcessRuntime {
         let mut ladder = Ladder::Idle;
         ladder.stop(StopTimes { signal_ms: 0, kill_ms: launch.grace_ms });
         while !reach.is_empty() {
-            let pause = ladder.step(&reach).unwrap_or_default();
+            let pause = ladder.step(&reach, launch.stop_signal).unwrap_or_default();
             // A program that obeys ends long before its grace does.
             tokio::time::sleep(pause.min(Duration::from_millis(20))).await;
         }

@@ -4,6 +4,7 @@ use std::collections::BTreeSet;
 use std::time::{Duration, Instant};
 
 use muster_agent_core::desired::StopTimes;
+use muster_api::kind::task::StopSignal;
 
 use super::scan;
 use crate::runtime::cgroup::group::Group;
@@ -35,10 +36,18 @@ impl Reach {
         self.pids().is_empty()
     }
 
-    pub(crate) fn terminate(&self) {
+    pub(crate) fn terminate(&self, signal: StopSignal) {
+        let signal = match signal {
+            StopSignal::SigTerm => libc::SIGTERM,
+            StopSignal::SigInt => libc::SIGINT,
+            StopSignal::SigQuit => libc::SIGQUIT,
+            StopSignal::SigHup => libc::SIGHUP,
+            StopSignal::SigUsr1 => libc::SIGUSR1,
+            StopSignal::SigUsr2 => libc::SIGUSR2,
+        };
         for pid in self.pids() {
             // SAFETY: kill takes no pointers. A pid that ended meanwhile is no error here.
-            unsafe { libc::kill(pid, libc::SIGTERM) };
+            unsafe { libc::kill(pid, signal) };
         }
     }
 
@@ -77,9 +86,9 @@ impl Reach {
 pub(crate) enum Ladder {
     /// Nobody asked for an end.
     Idle,
-    /// It may end by itself until SIGTERM is due.
+    /// It may end by itself until the signal is due that asks it to.
     Asked { signal: Instant, until: Instant },
-    /// SIGTERM was sent; SIGKILL follows at the deadline.
+    /// That was sent; SIGKILL follows at the deadline.
     Terminating { until: Instant },
     /// SIGKILL until nothing is left.
     Killing { pause: Duration },
@@ -104,7 +113,7 @@ impl Ladder {
         }
     }
 
-    /// Nobody is left who could end by itself: SIGTERM is due.
+    /// Nobody is left who could end by itself: the signal is due.
     pub(crate) fn signal_now(&mut self) {
         if let Ladder::Asked { signal, .. } = self {
             *signal = Instant::now();
@@ -118,14 +127,14 @@ impl Ladder {
         }
     }
 
-    /// Does what is due. Returns how long nothing more will be.
-    pub(crate) fn step(&mut self, reach: &Reach) -> Option<Duration> {
+    /// Does what is due; `stop` asks for an end. Returns how long nothing more will be.
+    pub(crate) fn step(&mut self, reach: &Reach, stop: StopSignal) -> Option<Duration> {
         if let Ladder::Asked { signal, until } = *self {
             let left = signal.saturating_duration_since(Instant::now());
             if !left.is_zero() {
                 return Some(left);
             }
-            reach.terminate();
+            reach.terminate(stop);
             *self = Ladder::Terminating { until };
         }
         if let Ladder::Terminating { until } = *self {

@@ -156,7 +156,8 @@ fn program(sheet: &mut Sheet, spec: &TaskSpec) {
         of_process(sheet, process);
     }
     sheet.field("Restarts", format!("{:?}", spec.restart_policy));
-    sheet.field("Grace", format!("{}s", spec.grace_period_seconds));
+    let (signal, grace) = (spec.stop_signal.name(), spec.grace_period_seconds);
+    sheet.field("Stop", format!("{signal}, SIGKILL after {grace}s"));
     let without_contact = match spec.stop_after_disconnect() {
         Some(after) => format!("stops after {after}"),
         None => "goes on".to_owned(),
